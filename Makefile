@@ -7,7 +7,7 @@ SPREAD := OMP_NUM_THREADS=1
 .PHONY: demo test test-slow bench gpu docs lint format clean
 
 demo: .venv/installed  ## simulate streets, segment and score them, and show all in demo/index.html
-	$(BIN)/amvnet demo --out demo
+	$(BIN)/amvnet demo --out demo --overwrite
 
 test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 measures which lines they run
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile $(if $(COVERAGE),--cov=amvnet --cov=lidarstreets --cov-report=term:skip-covered)

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -34,7 +35,7 @@ from amvnet.scan import Scan
 from amvnet.weights.file import save
 
 from fixtures.datasets import MAKERS, make_nuscenes
-from fixtures.worlds import fails, fresh_weights, refusal, run_cli, street
+from fixtures.worlds import fails, fresh_weights, refusal, run_cli, street, write_recipe
 
 COUNT = 7  # points of a scan
 PRECIOUS = b"hours of work"
@@ -191,6 +192,45 @@ def test_records_write_nothing_elsewhere(name: str, link: str, layout: str) -> N
             dataset.write_prediction(record, base / "out", ids)
 
 
+ENDINGS = st.sampled_from(["label", "npy", "ply", "npz", "uncertain.npy"])
+FILES = st.builds("{}.{}".format, st.sampled_from(["a", "b", "c/a"]), ENDINGS)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    kind=st.sampled_from(["label", "npy", "ply"]),
+    inputs=st.lists(FILES, min_size=1, max_size=3, unique=True),
+    links=st.dictionaries(FILES, FILES, max_size=3),
+    overwrite=st.booleans(),
+)
+def test_scans_among_the_outputs_are_not_changed(
+    kind: str, inputs: list[str], links: dict[str, str], overwrite: bool
+) -> None:
+    """The scans lie in the output folder, or links to them do. Empty files may be of any kind."""
+    with surroundings() as base:
+        out = base / "out"
+        paths = [out / name for name in inputs]
+        for path in paths:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        for link, target in links.items():
+            if target in inputs and link not in inputs:
+                (out / link).parent.mkdir(parents=True, exist_ok=True)
+                (out / link).symlink_to(out / target)
+        before = {path: (path.lstat().st_ino, path.read_bytes()) for path in paths}
+
+        scans: list[InputScan] = []
+        for name in ("a", "b", "c/a"):
+            path = paths[len(scans) % len(paths)]
+            scan = NamedScan(name, "source", path, ".bin", some_cloud)
+            scans.append(FileScan(scan, FileReader(None)))
+        output = OutputOptions(out, kind, scores=True, uncertain=True, overwrite=overwrite)
+        with suppress(InputError):
+            Pipeline(scans, label, output, NUSCENES).run({})
+        after = {path: (path.lstat().st_ino, path.read_bytes()) for path in paths}
+        assert after == before
+
+
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_hostile_name_is_refused_before_anything_is_written(name: str) -> None:
     with surroundings("linked", "a/linked") as base:
@@ -201,10 +241,28 @@ def test_a_hostile_name_is_refused_before_anything_is_written(name: str) -> None
 
 
 def test_a_file_that_is_a_link_is_replaced_and_not_followed() -> None:
-    with surroundings("good.label", "good.npz") as base:
+    """Here, the victims are labels and scores."""
+    with surroundings() as base:
+        write(base, [named("earlier")])
+        for ending in ("label", "npz"):
+            (base / f"out/earlier.{ending}").rename(base / f"victim/precious.{ending}")
+            (base / f"out/good.{ending}").symlink_to(base / f"victim/precious.{ending}")
+        before = contents_outside(base)
         write(base, [named("good")])
+        assert contents_outside(base) == before
         assert not (base / "out/good.label").is_symlink()
         assert np.fromfile(base / "out/good.label", np.uint32).shape == (COUNT,)
+        for ending in ("label", "npz"):  # as surroundings found them
+            (base / f"victim/precious.{ending}").write_bytes(PRECIOUS)
+
+
+@pytest.mark.parametrize("target", ["victim", "victim/precious", "victim/precious.label"])
+def test_a_link_to_something_else_than_labels_is_not_replaced(target: str) -> None:
+    with surroundings() as base:
+        (base / "out").mkdir()
+        (base / "out/good.label").symlink_to(base / target)
+        fails(partial(write, base, [named("good")]), base / "out/good.label", "; ")
+        assert (base / "out/good.label").is_symlink()
 
 
 def test_an_output_folder_may_be_a_link() -> None:
@@ -236,6 +294,52 @@ def test_every_verb_refuses_a_token_that_is_a_path(verb: str, weights: Path) -> 
     with surroundings(make=with_token("../../../victim/precious")) as base:
         line = refusal(verb.format(base=base, weights=weights))
         assert "'../../../victim/precious'" in line
+
+
+HOSTILE = "../../../victim/precious"
+# Verbs that write files with names of their own, whatever the data say.
+WRITERS = (
+    "view {base}/data/own.yaml --weights {base}/data/w.safetensors --html {base}/out/page.html",
+    "export --weights {base}/data/w.safetensors --out {base}/out",
+    "train {base}/data/r.yaml --data {base}/data/own.yaml --stage rv --out {base}/out",
+    "rank {base}/data/own.yaml --weights {base}/data/w.safetensors --out {base}/out/r.csv",
+    "evaluate {base}/data/own.yaml --weights {base}/data/w.safetensors --pictures {base}/out",
+    "predict {base}/data/own.yaml --weights {base}/data/w.safetensors --out {base}/out --scores",
+)
+
+
+def make_hostile(folder: Path) -> None:
+    """Make scans, weights and a recipe whose names of classes, sensors and sites are paths."""
+    classes = {HOSTILE: 1, "/etc/passwd": 2, "</script><b>": 3, "__proto__": 4, "{base}%s\\": 5}
+    for site in ("train", "val", "..a"):
+        (folder / site).mkdir(parents=True)
+        points, raw = street(0, 400)
+        np.save(folder / site / "%2e%2e%2fx.npy", points)
+        np.save(folder / site / "%2e%2e%2fx_labels.npy", raw % 5 + 1)
+    description = {
+        "name": HOSTILE,
+        "classes": classes,
+        "scans": "*/*x.npy",
+        "labels": "{name}_labels.npy",
+        "split": {"train": "train", "val": ["val", "..a"]},
+    }
+    (folder / "own.yaml").write_text(yaml.safe_dump(description))
+    write_recipe(folder / "r.yaml", training={"rv": {"epochs": 1}})
+    taxonomy = open_dataset(str(folder / "own.yaml")).taxonomy
+    save(replace(fresh_weights(taxonomy), sensor=HOSTILE), folder / "w.safetensors")
+
+
+@pytest.mark.parametrize("verb", WRITERS, ids=lambda verb: verb.split()[0])
+def test_names_in_the_data_do_not_lead_a_verb_elsewhere(verb: str) -> None:
+    """Nor does it change what it reads, or leave other files than those of the output."""
+    if verb.startswith("export"):
+        pytest.importorskip("onnxscript")
+    with surroundings(make=make_hostile) as base:
+        code, error = run_cli(*verb.format(base=base).split())
+        assert code in (0, 2), error
+        assert code == 0 or "Traceback" not in error
+        succeeded = [path for path in (base / "out").rglob("*") if path.is_file()]
+        assert (code == 0) == bool(succeeded), error
 
 
 @pytest.mark.parametrize("verb", VERBS[:2], ids=lambda verb: verb.split()[0])

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
+import os
 import shlex
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from amvnet.files import check_free
 from amvnet.inference.journal import JOURNAL, UNFINISHED
 from amvnet.onnx_runner import DESCRIPTION
+from amvnet.outputs import Signature, check_outputs
 from amvnet.weights.file import save
 
 from fixtures.worlds import (
@@ -26,13 +29,14 @@ from fixtures.worlds import (
 )
 
 MINE = b"hours of work"
+ANYTHING = Signature("a file", b"")
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset, lone scans, weights and predictions of the dataset with scores."""
     root = tmp_path_factory.mktemp("world")
-    make_streets(root / "data", ("08",))
+    make_streets(root / "data", ("00", "08"))
     save(fresh_weights(), root / "w.safetensors")
     (root / "scans").mkdir()
     for name in ("a", "b"):
@@ -41,12 +45,37 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the content of each file below a folder."""
+    return {name: (folder / name).read_bytes() for name in files(folder)}
+
+
+def saved(array: np.ndarray) -> bytes:
+    """Return the bytes of an array in a file of NumPy."""
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+PNG = b"\x89PNG\r\n\x1a\n...Software\0Matplotlib..."
+PLY = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+    b"property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
+    b"property int class\nend_header\n"
+)
+
+
 @dataclass(frozen=True)
 class Case:
-    """A command, and a file that it writes, relative to the folder of its output."""
+    """A command, a file that it writes, and an earlier file of this kind.
+
+    Attributes:
+        file: its path relative to the folder of the output.
+    """
 
     command: str
     file: str
+    earlier: bytes
 
     def text(self, world: Path, out: Path) -> str:
         return self.command.format(world=world, out=out)
@@ -54,24 +83,56 @@ class Case:
 
 WEIGHTS = "--weights {world}/w.safetensors"
 SCORES = "--scores-a {world}/predictions --scores-b {world}/predictions"
+SCANS = f"predict {{world}}/scans {WEIGHTS} --out {{out}}"
+LABELS = bytes(8)
 CASES = {
-    "predict": Case(f"predict {{world}}/scans {WEIGHTS} --out {{out}}", "b.label"),
-    "ply": Case(f"predict {{world}}/scans {WEIGHTS} --out {{out}} --format ply", "b.ply"),
-    "scores": Case(f"predict {{world}}/scans {WEIGHTS} --out {{out}} --scores", "a.npz"),
-    "uncertain": Case(
-        f"predict {{world}}/scans {WEIGHTS} --out {{out}} --uncertain", "a.uncertain.npy"
-    ),
+    "predict": Case(SCANS, "b.label", LABELS),
+    "npy": Case(f"{SCANS} --format npy", "b.npy", saved(np.zeros(3, np.uint32))),
+    "ply": Case(f"{SCANS} --format ply", "b.ply", PLY),
+    "scores": Case(f"{SCANS} --scores", "a.npz", b"PK\3\4" + bytes(26) + b"rv.npy"),
+    "uncertain": Case(f"{SCANS} --uncertain", "a.uncertain.npy", saved(np.zeros(3, bool))),
     "dataset": Case(
-        f"predict {{world}}/data {WEIGHTS} --out {{out}}", "sequences/08/predictions/000001.label"
+        f"predict {{world}}/data {WEIGHTS} --out {{out}}",
+        "sequences/08/predictions/000001.label",
+        LABELS,
     ),
     "fuse": Case(
-        f"fuse {{world}}/data {SCORES} --out {{out}}", "sequences/08/predictions/000000.label"
+        f"fuse {{world}}/data {SCORES} --out {{out}}",
+        "sequences/08/predictions/000000.label",
+        LABELS,
     ),
-    "rank": Case(f"rank {{world}}/data {WEIGHTS} --out {{out}}/r.csv --split all", "r.csv"),
+    "rank": Case(
+        f"rank {{world}}/data {WEIGHTS} --out {{out}}/r.csv --split all",
+        "r.csv",
+        b"rank,scan,score,x,y,z,points,point,rv,bev,label\n",
+    ),
     "submit": Case(
         "submit {world}/data --predictions {world}/predictions --split val --out {out}/e.zip",
         "e.zip",
+        b"PK\3\4" + bytes(26) + b"sequences/PK",
     ),
+    "view": Case(
+        f"view {{world}}/data {WEIGHTS} --html {{out}}/page.html",
+        "page.html",
+        b'<!doctype html>\n<meta name="generator" content="AMVNet">',
+    ),
+    "figures": Case(
+        "evaluate {world}/data --predictions {world}/predictions --json {out}/m.json",
+        "m.json",
+        b'{"dataset": "mine"}',
+    ),
+    "pictures": Case(
+        "evaluate {world}/data --predictions {world}/predictions --pictures {out}",
+        "08_000000.png",
+        PNG,
+    ),
+    "bench": Case(
+        f"bench {WEIGHTS} --runs 1 --scan {{world}}/scans/a.bin --json {{out}}/b.json",
+        "b.json",
+        b'{"engine": "torch"}',
+    ),
+    "analyze": Case(f"analyze {{world}}/data {WEIGHTS} --out {{out}}", "tau.png", PNG),
+    "table": Case(f"analyze {{world}}/data {WEIGHTS} --out {{out}}", "tau.csv", b"tau,mIoU %\n"),
 }
 
 
@@ -85,22 +146,155 @@ def test_a_users_file_stays_and_nothing_is_written(name: str, world: Path, tmp_p
     line = refusal(case.text(world, tmp_path))
     assert case.file in line
     assert "--overwrite" in line
+
+    # Nor is a file of another kind replaced.
+    line = refusal(case.text(world, tmp_path) + " --overwrite")
+    assert case.file in line
+    assert "found another file" in line
     assert mine.read_bytes() == MINE
     assert files(tmp_path) == {case.file}
 
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_earlier_file_of_the_same_kind_is_replaced_if_the_user_says_so(
+    name: str, world: Path, tmp_path: Path
+) -> None:
+    case = CASES[name]
+    earlier = tmp_path / case.file
+    earlier.parent.mkdir(parents=True, exist_ok=True)
+    earlier.write_bytes(case.earlier)
     succeed(case.text(world, tmp_path) + " --overwrite")
-    assert mine.read_bytes() != MINE
+    assert earlier.read_bytes() != case.earlier
 
 
-@pytest.mark.parametrize("name", ["predict", "dataset", "fuse", "rank", "submit"])
+@pytest.mark.parametrize("name", sorted(set(CASES) - {"bench", "table"}))
 def test_a_command_repeats_itself_only_if_told_to(name: str, world: Path, tmp_path: Path) -> None:
     case = CASES[name]
     command = case.text(world, tmp_path)
     succeed(command)
-    written = (tmp_path / case.file).read_bytes()
+    written = contents(tmp_path)
     assert "--overwrite" in refusal(command)
     succeed(f"{command} --overwrite")
-    assert (tmp_path / case.file).read_bytes() == written
+    assert contents(tmp_path) == written
+
+
+# Commands whose output {link} is a link to an input; the name of the input in the world.
+READ = {
+    "scan": (f"{SCANS} --overwrite", "b.label", "scans/b.bin"),
+    "scan as scores": (f"{SCANS} --scores --overwrite", "b.npz", "scans/b.bin"),
+    "weights": (f"{SCANS} --overwrite", "b.label", "w.safetensors"),
+    "true labels": (
+        f"predict {{world}}/data {WEIGHTS} --out {{out}} --overwrite",
+        "sequences/08/predictions/000000.label",
+        "data/sequences/08/labels/000001.label",
+    ),
+    "scores": (
+        f"fuse {{world}}/data {SCORES} --out {{out}} --overwrite",
+        "sequences/08/predictions/000000.label",
+        "predictions/sequences/08/predictions/000001.npz",
+    ),
+    "view": ("view {world}/scans/a.bin --html {out}/p.html --overwrite", "p.html", "scans/a.bin"),
+    "labels": (
+        "view {world}/scans/a.bin --labels {world}/a.label --html {out}/p.html --overwrite",
+        "p.html",
+        "a.label",
+    ),
+    "rank": (f"rank {{world}}/data {WEIGHTS} --out {{out}}/r.csv", "r.csv", "w.safetensors"),
+    "export": (f"export {WEIGHTS} --out {{out}}", "range_net.onnx", "w.safetensors"),
+    "evaluate": (f"evaluate {{world}}/data {WEIGHTS} --json {{out}}/m", "m", "w.safetensors"),
+    "analyze": (f"analyze {{world}}/data {WEIGHTS} --out {{out}}", "tau.csv", "w.safetensors"),
+    "bench": ("bench --scan {world}/scans/a.bin --json {out}/b", "b", "scans/a.bin"),
+    "train": (
+        "train semantickitti-compact --data {world}/data --out {out} --init {world}/w.safetensors",
+        "weights.safetensors",
+        "w.safetensors",
+    ),
+}
+
+
+@pytest.mark.parametrize("is_hard", [False, True])
+@pytest.mark.parametrize("name", READ)
+def test_no_output_is_an_input(name: str, is_hard: bool, world: Path, tmp_path: Path) -> None:
+    command, output, read = READ[name]
+    link = tmp_path / output
+    link.parent.mkdir(parents=True, exist_ok=True)
+    (world / "a.label").write_bytes(bytes(1200))
+    if is_hard:
+        os.link(world / read, link)
+    else:
+        link.symlink_to(world / read)
+
+    before = contents(world)
+    line = refusal(command.format(world=world, out=tmp_path))
+    assert "found the input" in line
+    assert str(link) in line
+    assert contents(world) == before
+    assert files(tmp_path) == {output}
+
+
+def test_a_scan_is_not_replaced_by_its_page(world: Path, tmp_path: Path) -> None:
+    scan = shutil.copy(world / "scans/a.bin", tmp_path)
+    command = f"view {scan} {WEIGHTS} --html {scan}".format(world=world)
+    for option in ("", " --overwrite"):
+        assert "found the input" in refusal(command + option)
+    assert contents(tmp_path) == {"a.bin": (world / "scans/a.bin").read_bytes()}
+
+
+def test_a_labelled_scan_is_not_replaced_by_labels_from_another_folder(
+    world: Path, tmp_path: Path
+) -> None:
+    """Points that predict has labelled are a scan, too."""
+    succeed(f"{SCANS} --format ply".format(world=world, out=tmp_path / "scans"))
+    (tmp_path / "out").symlink_to(tmp_path / "scans")
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files/a.ply").symlink_to(tmp_path / "scans/a.ply")
+    before = contents(tmp_path / "scans")
+    command = f"predict {tmp_path}/files {WEIGHTS} --out {tmp_path}/out --format ply --overwrite"
+    assert "found the input" in refusal(command.format(world=world))
+    assert contents(tmp_path / "scans") == before
+
+
+def test_a_device_is_not_replaced(world: Path) -> None:
+    line = refusal(f"evaluate {world}/data --predictions {world}/predictions --json /dev/null")
+    assert "found a device" in line
+    assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize("name", ["recipe.yaml", "weights.safetensors", "rv/last.ckpt", "head/a"])
+def test_a_run_takes_no_folder_with_files_of_its_names(
+    name: str, world: Path, tmp_path: Path
+) -> None:
+    mine = tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_bytes(MINE if "weights" not in name else (world / "w.safetensors").read_bytes())
+    before = contents(tmp_path)
+    line = refusal(f"train semantickitti-compact --data {world}/data --out {tmp_path} --resume")
+    assert "a new folder or that of a run" in line
+    assert contents(tmp_path) == before
+
+
+def test_the_table_of_an_ablation_is_replaced_only_among_its_runs(
+    world: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "ablation.csv").write_bytes(MINE)
+    line = refusal(f"ablate semantickitti-compact --data {world}/data --out {tmp_path}")
+    assert "ablation.csv" in line
+    assert contents(tmp_path) == {"ablation.csv": MINE}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "name"),
+    [("hdl64e", "sequences/01/velodyne/000000.bin"), ("hdl32e", "v1.0-trainval/scene.json")],
+)
+def test_real_scans_are_not_replaced_by_simulated_ones(
+    sensor: str, name: str, tmp_path: Path
+) -> None:
+    mine = tmp_path / name
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(MINE)
+    line = refusal(f"simulate {tmp_path} --sensor {sensor} --sequences 2 --scans 1")
+    assert "found another one" in line
+    assert contents(tmp_path) == {name: MINE}
 
 
 def test_export_keeps_to_it_before_it_exports(world: Path, tmp_path: Path) -> None:
@@ -160,7 +354,7 @@ def test_resuming_keeps_corrected_labels_and_a_users_own(world: Path, tmp_path: 
     out = tmp_path / "out"
     command = f"predict {scans} --weights {world}/w.safetensors --out {out} --resume"
     succeed(command)
-    (out / "a.label").write_bytes(MINE)
+    (out / "a.label").write_bytes(MINE)  # corrected
     succeed(command)
 
     shutil.copy(world / "scans/b.bin", scans)
@@ -175,12 +369,12 @@ def test_the_labels_of_a_broken_scan_stay_the_users(world: Path, tmp_path: Path)
     out.mkdir()
     shutil.copytree(world / "scans", tmp_path / "scans")
     (tmp_path / "scans/b.bin").write_bytes(b"truncated")
-    (out / "b.label").write_bytes(MINE)
+    (out / "b.label").write_bytes(LABELS)
     command = f"predict {tmp_path}/scans --weights {world}/w.safetensors --out {out}"
     code, error = run_cli(*shlex.split(f"{command} --overwrite"))
     assert code == 3
     assert "b.bin" in error
-    assert (out / "b.label").read_bytes() == MINE
+    assert (out / "b.label").read_bytes() == LABELS
 
 
 def test_a_run_that_writes_nothing_leaves_no_folder(world: Path, tmp_path: Path) -> None:
@@ -195,8 +389,8 @@ def test_the_message_counts_the_files(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ("a", "b", "c")]
     for path in paths:
         path.write_bytes(MINE)
-    fails(lambda: check_free(paths), tmp_path / "a", "and 2 more")
+    fails(lambda: check_outputs(dict.fromkeys(paths, ANYTHING)), tmp_path / "a", "and 2 more")
 
 
 def test_a_folder_is_not_called_another_file(tmp_path: Path) -> None:
-    fails(lambda: check_free([tmp_path]), tmp_path, "a folder")
+    fails(lambda: check_outputs({tmp_path: ANYTHING}, overwrite=True), tmp_path, "a folder")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import pydoc
 import re
 import subprocess
 import sys
 import textwrap
 import webbrowser
+from functools import partial
 from importlib import resources
 from pathlib import Path
 
@@ -171,8 +173,25 @@ def test_a_scan_is_never_replaced_by_its_labels(tmp_path: Path, segmenter: Segme
     write_pcd(tmp_path / "a.ply", POINTS, "binary")
     before = (tmp_path / "a.ply").read_bytes()
     result = segmenter(tmp_path / "a.ply")
-    fails(lambda: result.save(tmp_path / "a.ply"), "a.ply", "another file")
+    (tmp_path / "link.ply").symlink_to(tmp_path / "a.ply")
+    os.link(tmp_path / "a.ply", tmp_path / "hard.ply")
+    for name in ("a.ply", "link.ply", "hard.ply", "../" + tmp_path.name + "/a.ply"):
+        fails(partial(result.save, tmp_path / name), "a.ply", "found the input")
+        fails(partial(amvnet.show, result, tmp_path / name, False), "found the input")
     assert (tmp_path / "a.ply").read_bytes() == before
+    assert (tmp_path / "link.ply").is_symlink()
+
+
+def test_labels_replace_earlier_labels_and_nothing_else(
+    result: Segmentation, tmp_path: Path
+) -> None:
+    for kind in ("label", "npy", "ply"):
+        path = result.save(tmp_path / f"a.{kind}")
+        before = path.read_bytes()
+        assert result.save(path).read_bytes() == before
+        path.write_bytes(b"PK something else")
+        fails(partial(result.save, path), path, "found another file")
+        assert path.read_bytes() == b"PK something else"
 
 
 def test_show_writes_a_page_and_opens_it(

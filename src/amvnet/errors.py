@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import re
 import reprlib
 from collections.abc import Callable, Iterable, Iterator
@@ -88,6 +89,29 @@ def one_line_errors(
         if isinstance(error, InputError) or not is_bad_input:
             raise
         raise InputError(message(error)) from error
+
+
+# Errors of the system that are about this process, and not about the file that it opens.
+EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+
+
+@contextmanager
+def readable(path: object) -> Iterator[None]:
+    """Turn an error of the system in this block, which reads a file, into an `InputError`.
+
+    The file may have vanished since it was listed, may be private, or its disk may be broken.
+
+    Raises:
+        InputError: if the block raises an OSError that is about the file.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in EXHAUSTED:
+            raise
+        raise InputError(
+            f"{path}: expected a file that can be read, found {error.strerror or error}; check it"
+        ) from None
 
 
 def import_optional(module: str, extra: str) -> Any:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shutil
+import tempfile
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -27,7 +29,7 @@ REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENAMETOO
 LONGEST_NAME = 255  # bytes, in most file systems
 LONGEST_ENDING = 20  # characters, of the names of unfinished files
 
-unfinished: set[Path] = set()  # what is being written; to be removed if the process exits at once
+unfinished: set[Path] = set()  # files and folders to remove if the process exits at once
 
 
 @contextmanager
@@ -69,10 +71,33 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
 
         if error.filename == str(part):
             error.filename = str(path)
+        if error.filename is None:  # NumPy says only how many bytes were written
+            raise OSError(error.errno or errno.EIO, str(error), str(path)) from None
         raise
     finally:
         part.unlink(missing_ok=True)
         unfinished.discard(part)
+
+
+@contextmanager
+def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
+    """Yield a new folder, which is removed at the end, also if the process exits at once.
+
+    Args:
+        parent: the folder that it is made in; None means the system's for temporary files.
+    """
+    if parent is None:
+        folder = Path(tempfile.mkdtemp(prefix="amvnet-"))
+    else:
+        folder = parent / f".{uuid.uuid4().hex}.part"
+        make_folder(folder)
+
+    unfinished.add(folder)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        unfinished.discard(folder)
 
 
 def publish(part: Path, path: Path) -> None:
@@ -86,22 +111,6 @@ def publish(part: Path, path: Path) -> None:
             os.fsync(folder)
     finally:
         os.close(folder)
-
-
-def check_free(paths: Iterable[Path], overwrite: bool = False) -> None:
-    """Raise InputError if a command would replace a file, unless it is told to."""
-    existing = [path for path in paths if not overwrite and os.path.lexists(path)]
-    for path in existing:
-        if path.is_dir():
-            raise InputError(
-                f"{path}: expected a file to write, found a folder; give the name of a file in it"
-            )
-    if existing:
-        more = f" (and {len(existing) - 1} more)" if len(existing) > 1 else ""
-        raise InputError(
-            f"{existing[0]}{more}: expected no file, found one; change --out, or say --overwrite "
-            "to replace it"
-        )
 
 
 def inside(folder: Path | str, name: Path | str) -> Path:

@@ -85,9 +85,14 @@ class SemanticKittiLayout:
     poses: list[np.ndarray] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
 
+    @staticmethod
+    def place(out: Path, number: int) -> tuple[Path, bool]:
+        """Return the folder of a sequence, and whether it belongs to all sequences."""
+        return out / "sequences" / f"{number:02d}", False
+
     @property
     def folder(self) -> Path:
-        return self.out / "sequences" / f"{self.number:02d}"
+        return self.place(self.out, self.number)[0]
 
     def write_scan(self, index: int, scan: SimulatedScan) -> None:
         """Write one scan and its labels."""
@@ -123,6 +128,11 @@ class NuScenesLayout:
     out: Path
     number: int
     rows: list[Row] = field(default_factory=list)
+
+    @staticmethod
+    def place(out: Path, number: int) -> tuple[Path, bool]:
+        """Return the folder of the tables, and that it belongs to all sequences."""
+        return out / VERSION, True
 
     @property
     def name(self) -> str:

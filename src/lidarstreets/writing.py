@@ -48,6 +48,11 @@ class Sequence:
         """The file that exists once the sequence is complete."""
         return self.out / MARKERS / f"{self.number:04d}.json"
 
+    @property
+    def begun(self) -> Path:
+        """The file that exists once a call has begun to write the sequence."""
+        return self.marker.with_suffix(".begun")
+
 
 def simulate(
     out: Path | str,
@@ -82,7 +87,7 @@ def simulate(
 
     Raises:
         SimulationError: if the sensor is unknown, a number is too small, embreex is missing, or the
-            folder holds a sequence with other settings.
+            folder holds a sequence with other settings, or one that was not simulated.
     """
     layout = LAYOUTS[sensor_of(sensor).layout]
     _check_at_least(1, sequences=sequences, scans=scans, processes=processes)
@@ -94,6 +99,7 @@ def simulate(
     for number in range(first_sequence, first_sequence + sequences):
         sequence = Sequence(out, sensor, number, scans, seed)
         if not _is_complete(sequence):
+            _check_own(sequence)
             missing.append(sequence)
 
     done = scans * (sequences - len(missing))
@@ -121,6 +127,19 @@ def _is_complete(sequence: Sequence) -> bool:
             f"found it with {settings}; choose another folder"
         )
     return True
+
+
+def _check_own(sequence: Sequence) -> None:
+    """Raise if the folder of a sequence has files that were not simulated, such as real scans."""
+    place, belongs_to_all = LAYOUTS[sensor_of(sequence.sensor).layout].place(
+        sequence.out, sequence.number
+    )
+    begun = (sequence.out / MARKERS).glob("*") if belongs_to_all else [sequence.begun]
+    if os.path.lexists(place) and not any(path.exists() for path in begun):
+        raise SimulationError(
+            f"{place}: expected a folder of simulated scans or none, found another one; "
+            "choose another folder"
+        )
 
 
 def _write_sequences(sequences: list[Sequence], processes: int) -> Iterator[int]:
@@ -189,6 +208,7 @@ def _write(sequence: Sequence) -> Iterator[int]:
     model = SENSORS[sequence.sensor]
     layout = LAYOUTS[model.layout](sequence.out, sequence.number)
     seed = np.random.SeedSequence((sequence.seed, sequence.number))
+    write_whole(sequence.begun, b"")
     for index, scan in enumerate(drive_street(model, sequence.scans, seed)):
         layout.write_scan(index, scan)
         yield 1

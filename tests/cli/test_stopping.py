@@ -17,9 +17,10 @@ import pytest
 from amvnet.cli import main as command_line
 from amvnet.cli.main import GOES_ON, VERBS
 from amvnet.errors import InputError, SomeBroken
-from amvnet.files import unfinished
+from amvnet.files import atomic_write, temporary_folder, unfinished
 from amvnet.weights.file import save
 
+from fixtures.scan_writers import some_points, write_las
 from fixtures.worlds import fresh_weights, run_cli, street
 
 SOON = 5  # seconds on a busy machine; a second on an idle one
@@ -180,5 +181,47 @@ def test_a_stopped_predict_goes_on(number: int, tmp_path: Path) -> None:
         assert path.read_bytes() == (tmp_path / "parts" / path.name).read_bytes()
 
 
-def test_finished_files_are_not_listed_as_unfinished() -> None:
-    assert not unfinished
+TEMPORARY = """
+import sys, time
+from pathlib import Path
+from amvnet import read
+from amvnet.cli import main
+from amvnet.files import temporary_folder
+
+def run(verb, arguments):
+    read("{scan}")  # in a process of its own, which has a temporary folder
+    with temporary_folder(Path("{out}")) as folder:
+        (folder / "graph").write_text("half")
+        print("ready", flush=True)
+        while True:
+            time.sleep(60)
+
+main.run = run
+sys.argv = ["amvnet", "export"]
+sys.exit(main.main())
+"""
+
+
+def test_a_stopped_verb_leaves_no_temporary_folder(tmp_path: Path) -> None:
+    write_las(tmp_path / "a.laz", some_points())
+    (tmp_path / "temporary").mkdir()
+    script = TEMPORARY.replace("{scan}", str(tmp_path / "a.laz"))
+    script = script.replace("{out}", str(tmp_path / "out"))
+    environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        assert len(list((tmp_path / "temporary").iterdir())) == 1
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 143
+    assert not list((tmp_path / "temporary").iterdir())
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_finished_files_are_not_listed_as_unfinished(tmp_path: Path) -> None:
+    before = set(unfinished)
+    with atomic_write(tmp_path / "a.txt") as part, temporary_folder() as folder:
+        assert unfinished - before == {part, folder}
+    assert unfinished == before

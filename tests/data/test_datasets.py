@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 from pathlib import Path
@@ -237,6 +238,18 @@ def test_nuscenes_tables_that_cannot_be_used(tmp_path: Path) -> None:
     fails(lambda: open_dataset(layout.spec), samples)
     samples.unlink()
     fails(lambda: open_dataset(layout.spec), samples)
+
+
+def test_nuscenes_scans_are_in_the_order_of_time_whatever_the_order_of_the_table(
+    tmp_path: Path,
+) -> None:
+    layout = make_nuscenes(tmp_path)
+    expected = open_dataset(layout.spec).records(layout.sequences)
+    path = tmp_path / "v1.0-mini/sample_data.json"
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps(rows[::-1]))
+    records = open_dataset(layout.spec).records(layout.sequences)
+    assert [record.name for record in records] == [record.name for record in expected]
 
 
 def test_nuscenes_version_must_be_unambiguous(tmp_path: Path) -> None:

@@ -298,6 +298,11 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
         ({"scans": "../*.npy"}, "below"),
         ({"scans": "*/*.pcd"}, "found none"),
         ({"scans": ""}, "the key scans"),
+        ({"scans": "."}, "expected a pattern, found '.'"),
+        ({"scans": "a\0b"}, "found none"),
+        ({"scans": f"*/{'x' * 6000}.npy"}, "too long"),
+        ({"labels": f"../{'x' * 6000}/{{name}}.label"}, "File name too long"),
+        ({"root": "~nobody-has-this-name/x"}, "found none"),
         ({"labels": {"colour": 1}}, "colour"),
         ({"labels": "truth.npy"}, "{name}"),
         ({"split": {"training": "a"}}, "training"),
@@ -328,3 +333,15 @@ def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
     fails(lambda: read_scan_labels(site / "none.npy", 60, SEMANTICKITTI), "no file")
     np.save(site / "evil.npy", np.array([{}], object), allow_pickle=True)
     fails(lambda: read_scan_labels(site / "evil.npy", 1, SEMANTICKITTI), "evil.npy")
+
+
+def test_with_other_classes_the_scans_have_no_labels(site: Path) -> None:
+    """Their ids would mean other classes."""
+    np.save(site / "a.npy", some_points())
+    RAW.astype(np.uint32).tofile(site / "a.label")
+    data = open_own(describe(site.parent)).with_classes(SEMANTICKITTI)
+    (record,) = data.records(["site"])
+    assert data.taxonomy == SEMANTICKITTI
+    assert record.labels_path is None
+    assert data.read(record).labels is None
+    fails(lambda: data.labelled([record]), "no labels")

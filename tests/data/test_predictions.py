@@ -36,7 +36,7 @@ class Predictions:
     def score(self) -> float:
         """Return the mIoU that `amvnet evaluate` reports."""
         report = self.folder.parent / "report.json"
-        arguments = (self.spec, "--predictions", self.folder, "--json", report)
+        arguments = (self.spec, "--predictions", self.folder, "--json", report, "--overwrite")
         assert run_cli("evaluate", *arguments) == (0, "")
         return json.loads(report.read_text())["methods"]["predictions"]["miou"]
 

@@ -156,6 +156,13 @@ def test_sizes_of_the_benchmarks() -> None:
     assert SEMANTICKITTI.splits["val"] == ("08",)
 
 
+@pytest.mark.parametrize("text", ["a: 1\nb: 2\na: 3\n", "b: {c: 1, 'c': 2}\n", "- {1: a, 1: b}\n"])
+def test_a_key_twice_in_yaml_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    fails(lambda: read_yaml(path, "values"), path, "twice")
+
+
 def test_aliases_in_yaml_are_refused_and_anchors_are_not(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_text("a: &a [1, 2]\n")

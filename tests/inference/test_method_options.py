@@ -46,7 +46,7 @@ def test_evaluate_says_which_tau_was_chosen(world: Path) -> None:
     shares = []
     for tau in (0.0, 1.0):
         command = f"evaluate {world} --weights {world}/w.safetensors"
-        succeed(f"{command} --tau {tau} --json {world}/tau.json")
+        succeed(f"{command} --tau {tau} --json {world}/tau.json --overwrite")
         figures = json.loads((world / "tau.json").read_text())
         assert figures["tau"] == tau
         shares.append(figures["uncertain_fraction"])

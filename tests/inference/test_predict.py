@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -10,18 +12,20 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import amvnet
+from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_journals
-from amvnet.inference.listing import InputScan
+from amvnet.inference.listing import InputScan, list_inputs
 from amvnet.inference.pipeline import AHEAD, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.segmenter import Segmentation
@@ -30,7 +34,18 @@ from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
 from fixtures.counted_scans import Counter, counted_scans
-from fixtures.worlds import files, fresh_weights, refusal, run_cli, street, succeed
+from fixtures.datasets import MAKERS
+from fixtures.scan_writers import WRITERS, some_points
+from fixtures.worlds import (
+    fails,
+    files,
+    fresh_weights,
+    make_streets,
+    refusal,
+    run_cli,
+    street,
+    succeed,
+)
 
 WEIGHTS = "w.safetensors"
 SCANS = 12
@@ -495,3 +510,110 @@ def test_predict_segments_as_many_scans_at_a_time_as_asked_or_as_there_are_threa
     monkeypatch.setattr(Pipeline, "run", note)
     succeed(predict(world, tmp_path, options))
     assert seen == [expected]
+
+
+# ---- scans that vanish, or cannot be read any more, after they were listed
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_vanished_scan_is_a_broken_one(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    WRITERS[name](path, some_points())
+    (scan,), _ = list_inputs([str(path)])
+    path.unlink()
+    fails(scan.load, path, "; ")
+
+
+@pytest.mark.parametrize("layout", MAKERS)
+@pytest.mark.parametrize("name", ["points_path", "labels_path"])
+def test_a_vanished_scan_of_a_dataset_is_a_broken_one(
+    layout: str, name: str, tmp_path: Path
+) -> None:
+    MAKERS[layout](tmp_path)
+    dataset = open_dataset(f"{layout}:{tmp_path}")
+    record = dataset.records(dataset.sequences("all"))[0]
+    path = getattr(record, name)
+    path.unlink()
+    fails(lambda: dataset.read(record), path, "; ")
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ESTALE, errno.EIO, errno.ENOENT])
+@pytest.mark.parametrize("layout", ["", *MAKERS])
+def test_a_scan_that_the_system_refuses_is_a_broken_one(
+    layout: str, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if layout:
+        MAKERS[layout](tmp_path)
+    else:
+        street(0)[0].tofile(tmp_path / "a.bin")
+    scan, *_ = list_inputs([f"{layout}:{tmp_path}" if layout else str(tmp_path)])[0]
+
+    def refuse(path: Path, *arguments: object, **options: object) -> None:
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(np, "fromfile", refuse)
+    fails(scan.load, scan.path, os.strerror(number), "; check it")
+
+
+def test_that_the_process_has_too_many_files_open_is_no_fault_of_a_scan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    street(0)[0].tofile(tmp_path / "a.bin")
+    (scan,), _ = list_inputs([str(tmp_path)])
+
+    def refuse(*arguments: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(np, "fromfile", refuse)
+    with pytest.raises(OSError, match="Too many open files"):
+        scan.load()
+
+
+@pytest.mark.parametrize("spec", ["{root}", "semantickitti:{root}"])
+def test_scans_that_vanish_during_a_run_are_listed_and_the_others_are_done(
+    spec: str, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "data"
+    folder = root
+    if "kitti" in spec:
+        make_streets(root, ("08",), scans=4)
+        folder = root / "sequences/08/velodyne"
+    else:
+        root.mkdir()
+        for index in range(4):
+            street(index)[0].tofile(root / f"{index:06d}.bin")
+    run = Pipeline.run
+
+    def vanish_and_run(pipeline: Pipeline, *arguments: Any) -> Any:
+        (folder / "000000.bin").unlink()  # the first is also measured
+        (folder / "000002.bin").unlink()
+        return run(pipeline, *arguments)
+
+    monkeypatch.setattr(Pipeline, "run", vanish_and_run)
+    command = f"predict {spec.format(root=root)} --weights {world}/{WEIGHTS} --out {tmp_path}/out"
+    code, error = run_cli(*command.split())
+    assert code == 3
+    *faults, last = error.splitlines()
+    assert "2 of 4 scans segmented, 2 broken" in last
+    for name, fault in zip(("000000", "000002"), faults, strict=True):
+        assert f"{folder / name}.bin: expected" in fault
+    labels = sorted(path.stem for path in (tmp_path / "out").rglob("*.label"))
+    assert labels == ["000001", "000003"]
+
+
+def test_a_scan_that_vanishes_after_it_was_read_has_its_labels(world: Path, tmp_path: Path) -> None:
+    make_streets(tmp_path / "data", ("08",), scans=1)
+    (scan,), taxonomy = list_inputs([str(tmp_path / "data")])
+    loaded = scan.load()
+    ids = np.ones(len(loaded.scan), np.uint8)
+    scan.path.unlink()
+    result = Segmentation(ids, ids == 0, np.zeros((len(ids), 19), np.float32))
+    path = scan.write_labels(tmp_path / "out", loaded, result, "label", taxonomy)
+    assert np.fromfile(path, np.uint32).shape == ids.shape
+
+
+def test_the_disk_is_named_that_has_no_space(tmp_path: Path) -> None:
+    """NumPy says only how many bytes were written."""
+    with pytest.raises(OSError, match="1024 written") as caught, atomic_write(tmp_path / "a"):
+        raise OSError("2067 requested and 1024 written")
+    assert caught.value.filename == str(tmp_path / "a")

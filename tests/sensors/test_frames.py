@@ -145,11 +145,15 @@ def test_a_raised_road_is_not_upside_down() -> None:
     assert frame.height == pytest.approx(1.7, abs=0.05)
 
 
-def test_scans_that_sway_are_levelled_one_by_one() -> None:
+@pytest.mark.parametrize("tilt", [(8, 0), (0, 8)])
+def test_scans_that_sway_are_levelled_one_by_one(tilt: tuple[float, float]) -> None:
     weights = replace(fresh_weights(), sensor="hdl64e")
     normaliser = normaliser_for(weights)
-    for seed, pitch in enumerate((8, -8, 8, -8, 8, -8, 8)):
+    pitch, roll = tilt
+    for seed, side in enumerate((1, -1, 1, -1, 1, -1, 1)):
         xyz = scan_xyz(seed=seed)
-        cloud = Cloud(tilted(xyz, pitch, 0), np.linspace(0, 0.6, len(xyz)), name="a")
+        cloud = Cloud(
+            tilted(xyz, side * pitch, side * roll), np.linspace(0, 0.6, len(xyz)), name="a"
+        )
         scan = normaliser(cloud, "a")
         np.testing.assert_allclose(scan.points[:, 2], xyz[:, 2], atol=0.2)

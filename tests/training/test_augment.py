@@ -328,6 +328,9 @@ def test_a_roll_lifts_the_left_and_a_pitch_lowers_the_front() -> None:
     quarter = math.pi / 2
     np.testing.assert_allclose(tilt_rotation(quarter, 0) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(tilt_rotation(0, quarter) @ [1, 0, 0], [0, 0, -1], atol=1e-12)
+    # First about x, then about y.
+    both = tilt_rotation(quarter, quarter)
+    np.testing.assert_allclose(both @ [0, 1, 0], [1, 0, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("change", ["intensity_offset", "intensity_gamma"])
@@ -378,6 +381,9 @@ def test_every_laser_is_dimmed_by_one_factor_of_its_own(random_scan: RandomScan)
         factors.append(of_ring[0])
     assert 0.6 <= min(factors) < max(factors) <= 1.4
     assert len(np.unique(np.round(factors, 4))) > len(factors) / 2
+
+    scan.points[:, 3] = 0.9
+    assert augmented(scan, replace(OFF, laser_gain=0.4)).points[:, 3].max() == 1
 
 
 def test_a_scan_without_intensity_gets_none(random_scan: RandomScan) -> None:

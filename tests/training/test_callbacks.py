@@ -1,15 +1,19 @@
-"""The averaged weights equal a plain loop, and are those that are validated and written."""
+"""The weights that are averaged and kept, and the draws of each batch."""
 
 from __future__ import annotations
 
 from copy import deepcopy
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import torch
 from torch import nn
 
-from amvnet.training.callbacks import AverageWeights
+from amvnet.training.callbacks import AverageWeights, KeepWeights, SeedBatches
+from amvnet.weights.file import load
+
+from fixtures.worlds import fresh_weights
 
 
 def small_net() -> nn.Module:
@@ -92,3 +96,41 @@ def test_a_network_has_the_averaged_weights_only_in_the_validation() -> None:
     callback.on_validation_end(trainer, module)
     for name, value in net.state_dict().items():
         assert torch.equal(value, before[name])
+
+
+def test_the_best_weights_are_the_first_with_the_highest_miou(tmp_path: Path) -> None:
+    weights = fresh_weights()
+    module: Any = SimpleNamespace(trained=weights.build().range_net)
+    keep = object.__new__(KeepWeights)
+    keep.folder = tmp_path
+    keep.part = "range_net"
+    keep.weights = weights
+    keep.settings = {}
+    keep.record = {}
+    keep.started = 0.0
+    keep.highest = -1.0
+
+    for epoch, miou in enumerate((0.2, 0.5, 0.5, 0.3, 0.4)):
+        trainer: Any = SimpleNamespace(
+            callback_metrics={"val/miou": miou},
+            current_epoch=epoch,
+            is_global_zero=True,
+            callbacks=[],
+        )
+        keep.on_train_epoch_end(trainer, module)
+    kept = {name: load(tmp_path / f"{name}.safetensors").metrics for name in ("best", "last")}
+    assert kept["best"]["range_net"] == {"val/miou": 0.5, "epoch": 1}
+    assert kept["last"]["range_net"] == {"val/miou": 0.4, "epoch": 4}
+
+
+def test_each_batch_has_draws_of_its_own_which_a_resumed_run_repeats() -> None:
+    def draw(epoch: int, index: int, rank: int) -> tuple[float, ...]:
+        trainer: Any = SimpleNamespace(current_epoch=epoch)
+        module: Any = None
+        SeedBatches(7, rank).on_train_batch_start(trainer, module, None, index)
+        return tuple(torch.rand(3).tolist())
+
+    places = [(epoch, index, rank) for epoch in range(3) for index in range(3) for rank in (0, 1)]
+    draws = [draw(*place) for place in places]
+    assert len(set(draws)) == len(places)
+    assert [draw(*place) for place in places] == draws

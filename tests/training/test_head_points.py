@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
+import pytest
 
+from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import HeadTraining
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.select import TrainingScans
 from amvnet.runtime.distributed import ALONE, Processes
-from amvnet.training.head_points import PointSampler
+from amvnet.training.head_points import PointGatherer, PointSampler
+from amvnet.training.plan import Plan
+
+from fixtures.worlds import fresh_weights, make_streets, write_recipe
 
 ONE_CLASS = np.ones(1000, dtype=np.uint8)
 
@@ -61,3 +69,19 @@ def test_processes_share_each_batch_of_the_drawn_points() -> None:
         shares.append(iter(sampler_of(config, processes=Processes(rank, 2))))
     for whole, first, second in zip(sampler_of(config), *shares, strict=True):
         assert sorted(whole) == sorted([*first, *second])
+
+
+def test_the_points_that_are_drawn_stand_for_all_uncertain_ones(tmp_path: Path) -> None:
+    dataset = open_dataset(str(make_streets(tmp_path / "data", ("00",))))
+    records = dataset.records(["00"])
+    points = []
+    for most in (60, 10**6):
+        path = write_recipe(tmp_path / "r.yaml", training={"head": {"points": most}})
+        plan = Plan(load_recipe(str(path)), TrainingScans(dataset, records, []), tmp_path / "run")
+        points.append(PointGatherer(plan, fresh_weights()).gather(records, tmp_path / str(most)))
+
+    few, everything = points
+    assert len(few) == 60 < len(everything)
+    stand_for = few[np.arange(len(few))][3]
+    assert float(stand_for.sum()) == pytest.approx(len(everything))
+    assert (everything[np.arange(len(everything))][3] == 1).all()

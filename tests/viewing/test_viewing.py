@@ -308,7 +308,7 @@ def test_a_name_that_is_no_unicode_is_written(tmp_path: Path) -> None:
 
 
 def view_page(tmp_path: Path, *arguments: object) -> Page:
-    assert run_cli("view", *arguments, "--html", tmp_path / "out.html") == (0, "")
+    assert run_cli("view", *arguments, "--html", tmp_path / "out.html", "--overwrite") == (0, "")
     return read_page(tmp_path / "out.html")
 
 

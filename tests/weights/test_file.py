@@ -124,6 +124,18 @@ def test_parameters_of_half_precision_hardly_change_the_scores(
 
 
 @pytest.mark.parametrize("part", PARTS)
+def test_a_part_brings_its_metrics_and_the_record_of_its_training(
+    weights: Weights, part: str
+) -> None:
+    mine = {name: {"val/miou": 0.1} for name in PARTS}
+    theirs = {name: {"val/miou": 0.9} for name in PARTS}
+    other = replace(fresh_weights(seed=1), metrics=theirs)
+    mixed = replace(weights, metrics=mine).replace_part(part, other)
+    assert mixed.metrics == mine | {part: theirs[part]}
+    assert mixed.training == {**weights.training, part: other.training[part]}
+
+
+@pytest.mark.parametrize("part", PARTS)
 def test_replacing_a_part_changes_only_that_part(weights: Weights, part: str) -> None:
     other = fresh_weights(seed=1)
     mixed = weights.replace_part(part, other)
@@ -236,7 +248,12 @@ def test_for_other_classes_only_the_layers_that_depend_on_their_number_are_new()
         raw_to_train={0: 0, 1: 1, 2: 2},
         train_to_raw=(0, 1, 2),
     )
+    assert weights.training
+    assert weights.metrics
     begun, new = weights.for_classes(few, seed=1)
+    assert begun.taxonomy == few
+    assert not begun.training  # of other classes
+    assert not begun.metrics
 
     assert {name.split(".")[0] for name in new} == {"range_net", "polar_net", "point_head"}
     for name, tensor in weights.tensors.items():

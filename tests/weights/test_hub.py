@@ -36,6 +36,9 @@ class Hub:
             raise FileNotFoundError(f"\n404 Client Error.\n\nEntry Not Found for {repo_id}.")
         return str(path)
 
+    def file_exists(self, repo_id: str, filename: str) -> bool:
+        return (self.root / repo_id / filename).is_file()
+
     def create_repo(self, repo_id: str, private: bool, exist_ok: bool) -> None:
         self.calls.append({"repo_id": repo_id, "private": private})
         (self.root / repo_id).mkdir(parents=True, exist_ok=exist_ok)
@@ -65,6 +68,38 @@ def test_pushed_weights_can_be_loaded(hub: Hub) -> None:
     pushed = amvnet.load(fresh_weights())
     loaded = amvnet.load(NAME)
     assert np.array_equal(loaded(POINTS).labels, pushed(POINTS).labels)
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "README.md"])
+def test_what_the_hub_has_is_replaced_only_if_the_user_says_so(hub: Hub, file: str) -> None:
+    mine = hub.root / "somebody/streets" / file
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(b"hours of work")
+    fails(lambda: amvnet.push(fresh_weights(), NAME), "somebody/streets", file, "overwrite=True")
+    assert list(mine.parent.iterdir()) == [mine]
+    assert mine.read_bytes() == b"hours of work"
+
+    amvnet.push(fresh_weights(), NAME, overwrite=True)
+    assert mine.read_bytes() != b"hours of work"
+
+
+HOSTILE = (
+    *("a/..", "../a", "a/b/c", "/a", "a/", "a b/c", "a/b\n", "a/b\0", "a/-b", "ä/b"),
+    "a/" + "b" * 200,
+)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_that_no_repository_can_have_never_reach_the_hub(hub: Hub, name: str) -> None:
+    fails(lambda: amvnet.push(fresh_weights(), name), "OWNER/NAME")
+    fails(lambda: load(f"hf-hub:{name}"), "OWNER/NAME")
+    assert not hub.calls
+
+
+@pytest.mark.parametrize("revision", ["..", "../../x", "refs/../x", "/x", "a b", "x/"])
+def test_a_revision_is_no_path(hub: Hub, revision: str) -> None:
+    fails(lambda: load(f"{NAME}@{revision}"), "@REVISION")
+    assert not hub.calls
 
 
 def test_a_revision_can_be_named(hub: Hub) -> None:

@@ -73,7 +73,10 @@ class Stop:
             return
 
         for path in list(unfinished):
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
         console.show_cursor()  # a bar hides it
         stdout.flush()
         os._exit(self.exit_code)

@@ -12,8 +12,10 @@ import numpy as np
 
 from amvnet.evaluation.analysis import BINS, Analysis, SweptRow
 from amvnet.evaluation.metrics import metrics
+from amvnet.evaluation.top_view import PICTURE
 from amvnet.files import atomic_write
 from amvnet.models.methods import title_of
+from amvnet.outputs import Signature
 
 SIZE = (6.0, 3.6)  # inches
 DOTS_PER_INCH = 160
@@ -28,6 +30,17 @@ STYLES = {
     "ensemble": {"marker": "^", "linestyle": "-."},
     "amvnet": {"marker": "D", "linestyle": "-"},
 }
+
+
+TABLE = Signature("a table of analyze", rb"[^\n]*%")
+FIGURES = ("similarity", "distance", "tau")  # of `write_all`, each with a table
+TABLES = ("classes", "methods")  # of `write_all`, without a figure
+
+
+def files_of(out: Path, figures: Sequence[str], tables: Sequence[str]) -> dict[Path, Signature]:
+    """Return the files of figures, each with a table, and of tables alone in a folder."""
+    files = {out / f"{name}.csv": TABLE for name in (*figures, *tables)}
+    return files | {out / f"{name}.png": PICTURE for name in figures}
 
 
 def write_all(analysis: Analysis, dataset: str, out: Path) -> list[Path]:

@@ -11,7 +11,9 @@ import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.outputs import Signature
 
+REPORT = Signature("figures of evaluate", rb'\{\s*"dataset": ')
 # Metres; the distances of SemanticKITTI's evaluation by distance.
 EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
 

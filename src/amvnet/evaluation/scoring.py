@@ -18,7 +18,7 @@ from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
-from amvnet.evaluation.top_view import TopView, draw_scan
+from amvnet.evaluation.top_view import PICTURE, TopView, draw_scan
 from amvnet.files import inside
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
@@ -27,6 +27,7 @@ from amvnet.models.amvnet import Scores
 from amvnet.models.methods import METHODS, PAPER_METHODS
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import vote
+from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan, check_scan
@@ -86,7 +87,7 @@ def evaluate(
     true_table = labeller.table(dataset.taxonomy)
     table = labeller.table(labeller.taxonomy)
     evaluation = Evaluation(taxonomy)
-    pictured = {record.name for record in evenly_spaced(records, PICTURES)}
+    pictured = {record.name for record in _pictured(records)}
 
     def label(record: ScanRecord, scan: Scan) -> tuple[ScanRecord, Scan, MethodLabels]:
         return record, scan, labeller.label(record, scan)
@@ -104,9 +105,23 @@ def evaluate(
             view = TopView(
                 scan.points, taxonomy, ids, truth, title=record.name, uncertain=uncertain
             )
-            draw_scan(inside(pictures, f"{record.name.replace('/', '_')}.png"), view)
+            draw_scan(_picture_of(record, pictures), view)
 
     return sum(processes.gather(evaluation), Evaluation(taxonomy))
+
+
+def pictures_of(records: Sequence[ScanRecord], folder: Path) -> dict[Path, Signature]:
+    """Return the pictures that `evaluate` draws of some scans into a folder."""
+    return {_picture_of(record, folder): PICTURE for record in _pictured(records)}
+
+
+def _pictured(records: Sequence[ScanRecord]) -> Sequence[ScanRecord]:
+    """Return the scans that are drawn."""
+    return evenly_spaced(records, PICTURES)
+
+
+def _picture_of(record: ScanRecord, folder: Path) -> Path:
+    return inside(folder, f"{record.name.replace('/', '_')}.png")
 
 
 def stream_labelled(

@@ -14,6 +14,7 @@ import numpy as np
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Color, Taxonomy
 from amvnet.files import atomic_write
+from amvnet.outputs import Signature
 
 REACH = 50.0  # metres shown on each side of the sensor
 PANEL = 4.6  # inches, width and height of one panel
@@ -23,6 +24,7 @@ LEGEND_LINE = 0.2  # inches, height of one line of the legend
 LEGEND_MARGIN = 0.5  # inches
 DOT = 1.1  # area of a point in square typographic points
 
+PICTURE = Signature("a picture by Matplotlib", rb"\x89PNG.*Matplotlib")
 IGNORED: Color = (204, 204, 204)
 PLAIN = (0.75, 0.75, 0.75)  # RGB in [0, 1]
 

@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.export.onnx_files import digest, quiet, strip
+from amvnet.files import temporary_folder
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.reading import normaliser_for
 from amvnet.onnx_runner import OnnxSegmenter, open_session
@@ -48,9 +48,9 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
             f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; "
             "give scans of it to amvnet export --int8"
         )
-    with TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         simulate(folder, sensor=sensor, sequences=SCANS, scans=1, seed=SEED)
-        return _read(folder, weights)
+        return _read(str(folder), weights)
 
 
 def quantise(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -21,7 +19,7 @@ from amvnet.engines.base import build_model
 from amvnet.errors import InputError, import_optional
 from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, strip
-from amvnet.files import atomic_write, make_folder, publish
+from amvnet.files import atomic_write, publish, temporary_folder
 from amvnet.inference.reading import expectation_of
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName, check_method, widest_method
@@ -29,6 +27,7 @@ from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
+from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity, trained_intensity
@@ -37,6 +36,8 @@ from amvnet.sensors.lidars import SENSORS
 from amvnet.sensors.normalise import Expectation
 from amvnet.weights.file import Weights, load
 
+GRAPH = Signature("an ONNX graph", rb"\x08.\x12.(pytorch|onnx)")
+DESCRIBED = Signature("a description of ONNX graphs", rb'\{\s*"format": ')
 EXTRA = ("onnx", "onnxscript", "onnxruntime")
 OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it
 LARGEST_DIFFERENCE = 1e-4  # from torch, of probabilities or of features as `_shares`
@@ -110,27 +111,23 @@ def export(
 
     # Write everything into a temporary folder first.
     out = Path(out)
-    make_folder(out)
-    temporary = out / f".{uuid.uuid4().hex}.part"
-    temporary.mkdir()
-    try:
+    with temporary_folder(out) as temporary:
         description = _write_all(loaded, method, scans, temporary, progress)
         # After an interruption, the old description must not describe new graphs.
         (out / DESCRIPTION).unlink(missing_ok=True)
         graphs: dict[str, dict[str, Any]] = description["graphs"]
         for name in graphs:
             publish(temporary / f"{name}.onnx", out / f"{name}.onnx")
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
     with atomic_write(out / DESCRIPTION) as file:
         _save(description, file)
     return graphs
 
 
-def possible_files(out: Path) -> list[Path]:
-    """Return the paths of all files that `export` may write into a folder."""
-    return [out / f"{name}.onnx" for name in GRAPHS["amvnet"]] + [out / DESCRIPTION]
+def possible_files(out: Path) -> dict[Path, Signature]:
+    """Return all files that `export` may write into a folder."""
+    graphs = {out / f"{name}.onnx": GRAPH for name in GRAPHS["amvnet"]}
+    return {**graphs, out / DESCRIPTION: DESCRIBED}
 
 
 def _write_all(

@@ -271,7 +271,7 @@ class LabelScans:
         if loaded is None or isinstance(result, InputError):
             return self._row(row, error=str(result).replace(str(scan.path), row["path"]))
 
-        paths = pipeline.output.paths_of(scan)
+        paths = list(pipeline.output.files_of(scan))
         try:
             entry = pipeline.write(scan, loaded, result)
             if self._out.local is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -165,9 +166,10 @@ def fuse_files(
         taxonomy = head.taxonomy
 
     scans, taxonomy = list_inputs(inputs, options, taxonomy, normaliser)
+    scores = []
     for scan in scans:  # raises before anything is written
-        pair.a.find(scan.scores_path)
-        pair.b.find(scan.scores_path)
+        scores += [pair.a.find(scan.scores_path), pair.b.find(scan.scores_path)]
+    output = replace(output, also_read=[*output.also_read, *scores])
 
     fusion = Fusion(head, tau)
     silent: Counter[str] = Counter()  # points of which a model has no opinion, by its side

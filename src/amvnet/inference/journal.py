@@ -66,7 +66,8 @@ class Journal:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             (folder / JOURNAL).unlink(missing_ok=True)
             for path in folder.rglob(PARTS):  # files that earlier runs did not finish
-                path.unlink()
+                if path.is_file():
+                    path.unlink()
 
     def add(self, entry: Entry) -> None:
         """Write down that a scan is done."""

@@ -81,6 +81,12 @@ class DatasetScan:
         self.path = record.points_path
         self.scores_path = Path(record.prediction).with_suffix(".npz")
 
+    @property
+    def files(self) -> list[Path]:
+        """The files of its points and its labels."""
+        labels = self.record.labels_path
+        return [self.path] if labels is None else [self.path, labels]
+
     def labels_path(self, kind: str) -> Path:
         """Return the path of the file of its labels, relative to a folder of predictions."""
         return Path(self.record.prediction)
@@ -101,7 +107,11 @@ class DatasetScan:
         self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
     ) -> Path:
         """Write labels into a folder of predictions; return the path of the file."""
-        return self.dataset.write_prediction(self.record, folder, result.labels, self.written)
+        # The file may have vanished since it was read.
+        count = len(loaded.scan)
+        return self.dataset.write_prediction(
+            self.record, folder, result.labels, self.written, count=count
+        )
 
 
 def _title_of(record: ScanRecord) -> str:
@@ -165,6 +175,11 @@ class FileScan:
         self.source = scan.source
         self.path = scan.path
         self.scores_path = Path(f"{scan.name}.npz")
+
+    @property
+    def files(self) -> list[Path]:
+        """The file that it is in; those of a bag that is a folder."""
+        return [*self.path.iterdir()] if self.path.is_dir() else [self.path]
 
     def labels_path(self, kind: str) -> Path:
         """Return the path of its labels in a format, relative to a folder of predictions."""

@@ -17,14 +17,21 @@ from typing import Any, TypeVar
 import numpy as np
 
 from amvnet.data.formats.registry import COLUMN_READERS
-from amvnet.data.labels.writers import check_kind, write_uncertain
+from amvnet.data.labels.writers import (
+    SCORES,
+    SIGNATURES,
+    UNCERTAIN,
+    check_kind,
+    write_uncertain,
+)
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken, memory_for
-from amvnet.files import atomic_write, check_free, inside
+from amvnet.files import atomic_write, inside
 from amvnet.inference.journal import UNFINISHED, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
+from amvnet.outputs import Signature, check_not_read, check_outputs
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED
@@ -45,6 +52,7 @@ class OutputOptions:
         uncertain: also write (N,) bool, the uncertain points, as `.uncertain.npy`.
         overwrite: replace files that exist.
         resume: leave out the scans that an earlier run into the same folder has done.
+        also_read: files besides the scans that the command reads; what names no file is left out.
 
     Raises:
         InputError: if the format is unknown.
@@ -56,18 +64,21 @@ class OutputOptions:
     uncertain: bool = False
     overwrite: bool = False
     resume: bool = False
+    also_read: Sequence[Path | str | None] = ()
 
     def __post_init__(self) -> None:
         check_kind(self.kind)
 
-    def paths_of(self, scan: InputScan) -> list[Path]:
-        """Return the paths of a scan's files, relative to the folder."""
-        paths = [scan.labels_path(self.kind)]
+    def files_of(self, scan: InputScan) -> dict[Path, Signature]:
+        """Return what is written for a scan, by the path relative to the folder."""
+        labels = scan.labels_path(self.kind)
+        ending = labels.suffix or f".{self.kind}"  # of a name that is nothing but its ending
+        files = {labels: SIGNATURES[ending]}
         if self.scores:
-            paths.append(scan.scores_path)
+            files[scan.scores_path] = SCORES
         if self.uncertain:
-            paths.append(scan.scores_path.with_suffix(UNCERTAIN_ENDING))
-        return paths
+            files[scan.scores_path.with_suffix(UNCERTAIN_ENDING)] = UNCERTAIN
+        return files
 
 
 # Segments scans in memory, given where each is from; an InputError says that one is broken.
@@ -112,7 +123,7 @@ class Pipeline:
 
         Raises:
             InputError: if two scans would have the same files, an output folder is that of a scan,
-                a file would be replaced, or another run is writing into the folder.
+                a file may not be written, or another run is writing into the folder.
         """
         folder = self.output.folder
         is_new = not folder.exists()
@@ -141,16 +152,22 @@ class Pipeline:
         """Raise InputError if a file may not be written: only those of `earlier` are replaced."""
         folder = self.output.folder
         _check_names(self.scans)
-        new_paths: list[Path] = []
+        inputs = list(self.output.also_read)
+        own_files: list[Path] = []
+        new_files: dict[Path, Signature] = {}
         for scan in self.scans:
-            paths = [inside(folder, path) for path in self.output.paths_of(scan)]
+            inputs += scan.files
+            for path, signature in self.output.files_of(scan).items():
+                if _key(scan) in earlier:
+                    own_files.append(inside(folder, path))
+                else:
+                    new_files[inside(folder, path)] = signature
             _check_folder(scan, self.output)
-            if _key(scan) not in earlier:
-                new_paths += paths
 
+        check_not_read(own_files, inputs)
         # The journal of a run that was killed lacks the files that it wrote last.
         is_killed = self.output.resume and (folder / UNFINISHED).exists()
-        check_free(new_paths, self.output.overwrite or is_killed)
+        check_outputs(new_files, inputs, self.output.overwrite or is_killed)
 
     def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return the entries of an earlier run whose scans need not be segmented again.
@@ -163,7 +180,7 @@ class Pipeline:
             entry = earlier.get(_key(scan))
             if entry is None:
                 continue
-            paths = [self.output.folder / path for path in self.output.paths_of(scan)]
+            paths = [self.output.folder / path for path in self.output.files_of(scan)]
             is_same = entry.origin == self._origins[entry.scan]
             if not is_same or not all(map(Path.is_file, paths)):
                 del done[entry.scan]

@@ -38,6 +38,7 @@ def predict(
     batch: int = 1,
     overwrite: bool = False,
     resume: bool = False,
+    also_read: Sequence[Path | str | None] = (),
     progress: Progress = no_progress,
     say: Say = say_nothing,
 ) -> int:
@@ -52,6 +53,7 @@ def predict(
         batch: scans that go through the networks together.
         overwrite: replace files that exist.
         resume: leave out the scans that an earlier run with an equal request has done.
+        also_read: files besides the scans that the command reads, which are not written.
         say: takes lines about what was assumed of the sensor, and at the end how sure the labels
             are, if there are two networks.
 
@@ -74,10 +76,11 @@ def predict(
                 scan.written = classes.target
         taxonomy = classes.target
 
+    output = request.output(folder, overwrite=overwrite, resume=resume)
     pipeline = Pipeline(
         scans,
         segment_by(segmenter, classes),
-        request.output(folder, overwrite=overwrite, resume=resume),
+        replace(output, also_read=also_read),
         taxonomy,
         batch=batch,
         at_once=segmenter.at_once,

@@ -10,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from amvnet.data.labels.writers import KINDS, write_scan_labels
+from amvnet.data.labels.writers import KINDS, SIGNATURES, write_scan_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import Scores
+from amvnet.outputs import check_outputs
 from amvnet.scan import Scan
 
 NAMED = 3  # classes in the short description of a result
@@ -183,7 +184,7 @@ class Segmentation:
         return "" if self.origin is None else self.origin.assumed
 
     def save(self, path: Path | str) -> Path:
-        """Write the labels, in the format of the path's ending; an existing file is replaced.
+        """Write the labels, in the format of the path's ending; earlier labels are replaced.
 
         `.label` and `.npy` hold the raw ids; `.ply` the points too, coloured by class,
         with the coordinates of the scan's file (`write_scan_labels` describes them).
@@ -192,8 +193,8 @@ class Segmentation:
             The path.
 
         Raises:
-            InputError: if the ending is another one, the path is that of the scan itself, or
-                the file cannot be written.
+            InputError: if the ending is another one, the file is that of the scan itself or holds
+                something else than labels, or it cannot be written.
         """
         origin = self.require_origin()
         path = Path(path)
@@ -203,8 +204,7 @@ class Segmentation:
                 f"{path}: expected a name that ends in .{', .'.join(KINDS)}, "
                 f"found {path.suffix or 'no ending'}; rename it"
             )
-        if origin.path is not None and path.resolve() == origin.path.resolve():
-            raise InputError(f"{path}: expected another file than the scan's, found it; rename it")
+        check_outputs({path: SIGNATURES[path.suffix]}, [origin.path], overwrite=True)
 
         xyz = origin.scan.points[:, :3] if origin.file_xyz is None else origin.file_xyz
         return write_scan_labels(

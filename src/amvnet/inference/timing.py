@@ -16,6 +16,7 @@ from amvnet.inference.segmentation import label_ids
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import AMVNet, Watch, one_after_the_other
 from amvnet.models.methods import geometric_mean
+from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.runtime.memory import peak_memory
 from amvnet.scan import Scan
@@ -28,6 +29,9 @@ MEBIBYTE = 2**20
 
 Read = Callable[[], Scan]
 Write = Callable[[np.ndarray], object]
+
+
+TIMES = Signature("figures of bench", rb'\{\s*"engine": ')
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from amvnet.files import atomic_write
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
+from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan, check_scan
@@ -34,6 +35,7 @@ FEW = 20.0
 COMMON = 0.5
 
 COLUMNS = ("rank", "scan", "score", "x", "y", "z", "points", "point", "rv", "bev", "label")
+TABLE = Signature("a table of rank", ",".join(COLUMNS).encode())
 
 # One cluster. Its middle point is the one nearest to the mean of its points.
 ROW = np.dtype(

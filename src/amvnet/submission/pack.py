@@ -10,6 +10,7 @@ from pathlib import Path
 from amvnet.data.labels.ids import check_size
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
+from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.submission.rules import LIDAR_ALONE, Rules
 
@@ -17,6 +18,8 @@ ENDING = ".zip"
 LEVEL = 6  # of deflate: 9 takes five to eight times as long and saves a sixth
 # The time of every entry, so that the same content gives the same bytes.
 LONG_AGO = (1980, 1, 1, 0, 0, 0)
+# The first entry is a folder.
+ARCHIVE = Signature("an archive of submit", rb"PK\x03\x04.{26}(sequences|lidarseg)/PK")
 UNIX = 3  # code of the system that wrote an entry
 FOLDER_BIT = 0x10  # of an entry's MS-DOS attributes
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from amvnet import load
@@ -15,7 +16,11 @@ from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.training.plan import Plan
 from amvnet.training.run import train
+from amvnet.training.run_folder import is_run
 from amvnet.weights.file import Weights
+
+# Whether with the GRU, and whether with class weights.
+VARIANTS = ((False, False), (True, False), (False, True), (True, True))
 
 
 def sweep_heads(
@@ -67,6 +72,11 @@ def _networks(weights: Weights, model: ModelConfig) -> Weights:
     return networks
 
 
+def is_begun(out: Path) -> bool:
+    """Return whether an earlier call of `ablate` has trained in a folder."""
+    return any(is_run(out / _name(gru, weighted)) for gru, weighted in VARIANTS)
+
+
 def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[str, Any]]]:
     """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
 
@@ -79,8 +89,8 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
     Raises:
         InputError: if a folder holds a run on other scans or of another recipe.
     """
-    for gru, weighted in ((False, False), (True, False), (False, True), (True, True)):
-        name = "rv" + ("-gru" if gru else "") + ("-weights" if weighted else "")
+    for gru, weighted in VARIANTS:
+        name = _name(gru, weighted)
         plan.say(f"{name}:")
         recipe = _ablated(plan.recipe, gru, weighted)
         path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name), "rv")
@@ -94,6 +104,11 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
             processes=plan.processes,
         )
         yield gru, weighted, metrics(evaluation.matrices["rv"][0], scans.dataset.taxonomy)
+
+
+def _name(gru: bool, weighted: bool) -> str:
+    """Return the name of the folder of a variant."""
+    return "rv" + ("-gru" if gru else "") + ("-weights" if weighted else "")
 
 
 def _ablated(recipe: Recipe, gru: bool, weighted: bool) -> Recipe:

@@ -17,8 +17,8 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.progress import Tenths, counted
 from amvnet.training.plan import Plan
+from amvnet.training.run_folder import COUNTS
 
-COUNTS = "class_counts.npz"  # in the folder of the run
 NAMED = 3  # broken scans in a message
 
 

@@ -36,6 +36,7 @@ class Plan:
         processes: those that share the run; all must see its folder.
         scores: two other models' scores of the scans, to train the head on instead of on the
             networks'; None without other models.
+        also_read: files besides the scans that the run reads; what names no file is left out.
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, or the recipe is for
@@ -50,6 +51,7 @@ class Plan:
     bars: bool = False
     processes: Processes = ALONE
     scores: ScorePair | None = None
+    also_read: Sequence[Path | str | None] = ()
 
     def __post_init__(self) -> None:
         size = self.processes.size

@@ -17,7 +17,9 @@ from amvnet.training.plan import Plan
 from amvnet.training.run_folder import (
     DONE,
     PART_OF,
+    WEIGHTS,
     check_begun,
+    check_folder,
     is_finished,
     stage_settings,
     with_trained,
@@ -41,6 +43,7 @@ def train(
     if plan.scores is not None and names != ("head",):
         raise InputError(f"expected --stage head for scores of other models, found {stage}; add it")
 
+    check_folder(plan)
     # Check all stages before anything is written, and before hours are spent on the first.
     weights = _first_weights(plan, init, names)
     for name in names:
@@ -52,7 +55,7 @@ def train(
     keep_counts(plan, counts)
 
     # Save after each stage, so that one that fails does not lose the others.
-    path = plan.out / "weights.safetensors"
+    path = plan.out / WEIGHTS
     for name in names:
         weights = train_stage(plan, name, weights)
         if plan.processes.first:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
@@ -17,6 +18,7 @@ from amvnet.data.datasets.joined import Joined
 from amvnet.errors import InputError
 from amvnet.files import atomic_write, parse_yaml
 from amvnet.models.methods import BOTH_NETWORKS
+from amvnet.outputs import check_not_read
 from amvnet.training.plan import Plan
 from amvnet.weights.file import SIZES, Weights, load
 
@@ -25,8 +27,36 @@ PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 LAST = "last.ckpt"  # in a stage's folder: what --resume continues from
 DONE = "done"  # in a stage's folder: an empty file once the stage is finished
 SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
+RECORD = "run.yaml"  # in the folder of a run: what each call read
+RECIPE = "recipe.yaml"
+WEIGHTS = "weights.safetensors"
+COUNTS = "class_counts.npz"  # points of each class
 MOST_CHANGES = 6  # settings that a message names
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")
+
+
+def is_run(out: Path) -> bool:
+    """Return whether a folder is that of a run."""
+    entries = _entries(out / RECORD).values()
+    return any(isinstance(entry, dict) and "versions" in entry for entry in entries)
+
+
+def check_folder(plan: Plan) -> None:
+    """Check that a run may write into its folder, which is new or that of an earlier run.
+
+    Raises:
+        InputError: if what the run would write is there without a run, or is an input.
+    """
+    names = (RECIPE, WEIGHTS, COUNTS, RECORD, *PART_OF)
+    check_not_read([plan.out / name for name in names], plan.also_read)
+    if is_run(plan.out):
+        return
+    for name in names:
+        if os.path.lexists(plan.out / name):
+            raise InputError(
+                f"{plan.out}: expected a new folder or that of a run, found {name} without the "
+                f"{RECORD} of a run; give another folder"
+            )
 
 
 def is_finished(plan: Plan, name: str) -> bool:
@@ -56,11 +86,11 @@ def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
         entry["scores"] = repr(plan.scores)
 
     # The entries of earlier calls, for other stages, stay; the new one comes last.
-    entries = _entries(plan.out / "run.yaml")
+    entries = _entries(plan.out / RECORD)
     entries.pop(stage, None)
     entries[stage] = entry
-    write_yaml(plan.out / "recipe.yaml", to_dict(plan.recipe))
-    write_yaml(plan.out / "run.yaml", entries)
+    write_yaml(plan.out / RECIPE, to_dict(plan.recipe))
+    write_yaml(plan.out / RECORD, entries)
 
 
 def write_yaml(path: Path, tree: dict[str, Any]) -> None:

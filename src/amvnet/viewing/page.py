@@ -25,6 +25,7 @@ from amvnet.evaluation.metrics import OVERALL, Evaluation
 from amvnet.files import atomic_write
 from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
+from amvnet.outputs import Signature, check_outputs
 from amvnet.viewing.shown_scans import RIGHT, UNLABELLED, UNSCORED, ShownScan, shown_scan
 
 # Of larger scans the page shows every second or third point, so that phones keep up.
@@ -32,6 +33,7 @@ MOST_POINTS = 400_000
 # Metres along each axis. Farther points are left out, so that int16 is off by 0.8 cm at most.
 REACH = 500.0
 LEVELS = 32_767  # largest int16
+PAGE = Signature("a page of view", rb'<!doctype html>.*<meta name="generator" content="AMVNet">')
 STOPS = 17  # colours between which the page interpolates a ramp
 # Matplotlib's colour map for each ramp, and the part of it that is used, in [0, 1].
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
@@ -78,12 +80,14 @@ def show(result: Segmentation, path: Path | str | None = None, open_browser: boo
     It has the labels, also of each network, uncertain points, and errors if the scan has labels.
 
     Args:
-        path: the file, NAME.html; by default in a temporary folder.
+        path: the file, NAME.html; by default in a temporary folder. An earlier page is replaced.
 
     Raises:
-        InputError: if the file cannot be written.
+        InputError: if the file cannot be written, or is another one than a page.
     """
     origin = result.require_origin()
+    if path is not None:
+        check_outputs({Path(path): PAGE}, [origin.path], overwrite=True)
     title = Path(origin.scan.name).name or "scan"
     shown = shown_scan(result, origin)
     page = Path(path or temporary_page())

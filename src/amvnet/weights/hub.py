@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from amvnet.errors import InputError, import_optional, one_line_errors
+from amvnet.errors import InputError, import_optional, one_line_errors, shown
 
 PREFIX = "hf-hub:"
 FILE = "model.safetensors"
+# An owner, a name, or a part of a revision: no path that leads elsewhere.
+WORD = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,94}[A-Za-z0-9_])?", re.ASCII)
 
 
 def fetch(name: str) -> Path:
@@ -26,6 +29,10 @@ def fetch(name: str) -> Path:
     """
     repository, _, revision = name.removeprefix(PREFIX).partition("@")
     check_name(repository, name)
+    if not all(map(WORD.fullmatch, revision.split("/"))) and revision:
+        raise InputError(
+            f"expected {PREFIX}OWNER/NAME@REVISION, found {shown(name)}; correct the revision"
+        )
     hub = import_optional("huggingface_hub", "hub")
 
     with hub_errors(name, f"check the name and the network, and that {FILE} is there"):
@@ -35,8 +42,11 @@ def fetch(name: str) -> Path:
 
 def check_name(repository: str, name: str) -> None:
     """Check that a repository has the form OWNER/NAME; raise InputError with `name` if not."""
-    if repository.count("/") != 1 or not all(repository.split("/")):
-        raise InputError(f"expected {PREFIX}OWNER/NAME, found {name!r}; name both")
+    if repository.count("/") != 1 or not all(map(WORD.fullmatch, repository.split("/"))):
+        raise InputError(
+            f"expected {PREFIX}OWNER/NAME of letters, digits and -_. between them, found "
+            f"{shown(name)}; correct the name"
+        )
 
 
 def hub_errors(name: str, advice: str) -> AbstractContextManager[None]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from amvnet.errors import import_optional
+from amvnet.errors import InputError, import_optional
+from amvnet.files import temporary_folder
 from amvnet.weights.card import front_matter, model_card
 from amvnet.weights.file import Weights, load, save
 from amvnet.weights.hub import FILE, PREFIX, check_name, hub_errors
@@ -14,7 +14,12 @@ CARD = "README.md"
 
 
 def push(
-    weights: Weights | Path | str, name: str, licence: str | None = None, private: bool = False
+    weights: Weights | Path | str,
+    name: str,
+    licence: str | None = None,
+    private: bool = False,
+    *,
+    overwrite: bool = False,
 ) -> str:
     """Upload weights to the hub, with their card as README.md, from the account that is logged in.
 
@@ -24,13 +29,15 @@ def push(
         licence: the hub's name of the licence, such as "apache-2.0" or "cc-by-nc-sa-4.0". Mind
             the terms of the data that the weights were trained on.
         private: make the repository private if it is created.
+        overwrite: replace weights and a card that the repository has; the hub keeps the earlier
+            ones in its history.
 
     Returns:
         The URL of the commit.
 
     Raises:
-        InputError: if there are no such weights, the hub refuses them, or its client is not
-            installed.
+        InputError: if there are no such weights, the repository has some and `overwrite` is false,
+            the hub refuses them, or its client is not installed.
     """
     name = name.removeprefix(PREFIX)
     check_name(name, name)
@@ -38,12 +45,21 @@ def push(
         weights = load(weights)
     hub = import_optional("huggingface_hub", "hub")
 
-    with TemporaryDirectory() as folder:
-        save(weights, Path(folder) / FILE)
-        card = front_matter(weights, licence) + model_card(weights, f"{PREFIX}{name}", licence)
-        (Path(folder) / CARD).write_text(card, encoding="utf-8")
+    advice = "check the name and the network, and log in with hf auth login"
+    with hub_errors(name, advice):
+        present = [file for file in (FILE, CARD) if hub.file_exists(name, file)]
+    if present and not overwrite:
+        raise InputError(
+            f"{name}: expected a repository without {present[0]}, found one; push to another name, "
+            "or say overwrite=True to replace it"
+        )
 
-        with hub_errors(name, "check the name and the network, and log in with hf auth login"):
+    with temporary_folder() as folder:
+        save(weights, folder / FILE)
+        card = front_matter(weights, licence) + model_card(weights, f"{PREFIX}{name}", licence)
+        (folder / CARD).write_text(card, encoding="utf-8")
+
+        with hub_errors(name, advice):
             hub.create_repo(repo_id=name, private=private, exist_ok=True)
             commit = hub.upload_folder(
                 repo_id=name,

@@ -8,6 +8,8 @@ from typing import Any
 from amvnet.cli.console import on_terminal, say, say_lines
 from amvnet.cli.options import TrainingChoice, describe_records, join_processes
 
+TABLE = "ablation"  # name of the table, without an ending
+
 
 def ablate(
     recipe: Any,
@@ -28,8 +30,10 @@ def ablate(
             there is a GPU.
     """
     from amvnet.evaluation import charts
+    from amvnet.outputs import check_outputs
     from amvnet.runtime.distributed import device_of
     from amvnet.training.ablation import ablate as ablate_recipe
+    from amvnet.training.ablation import is_begun
     from amvnet.training.plan import Plan, open_for_training
 
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
@@ -37,8 +41,11 @@ def ablate(
     scans = choice.scans(dataset)
     say(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
 
+    table = {out / f"{TABLE}.csv": charts.TABLE}
+    check_outputs(table, [data], overwrite=is_begun(out))
+    processes.wait()
     plan = Plan(recipe, scans, out, resume=True, say=say, bars=on_terminal(), processes=processes)
     rows = list(ablate_recipe(plan, device))
     if processes.first:
-        files = charts.write_ablation(rows, out / "ablation")
+        files = charts.write_ablation(rows, out / TABLE)
         say_lines(files[-1].read_text().rstrip())

@@ -27,6 +27,7 @@ def analyze(
     taus: tuple[Share, ...] | None = None,
     recipe: str | None = None,
     train_sequences: tuple[str, ...] | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Draw the paper's figures: agreement, mIoU by distance, sweeps, tables by class and by method.
 
@@ -43,6 +44,7 @@ def analyze(
         recipe: how these heads are trained: a built-in recipe's name or a YAML file.
         train_sequences: sequences or scenes, separated by commas, that these heads learn from;
             default: the official split.
+        overwrite: replace figures that exist.
     """
     from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.select import TrainingScans
@@ -50,6 +52,7 @@ def analyze(
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
+    from amvnet.outputs import check_outputs
     from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
     from amvnet.training.plan import Plan
     from amvnet.weights.file import load
@@ -65,6 +68,10 @@ def analyze(
     records = choice.records(dataset)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
+    asked = {"neighbours": neighbours, "taus": taus}
+    studied = [name for name, values in asked.items() if values]
+    outputs = charts.files_of(out, (*charts.FIGURES, *studied), charts.TABLES)
+    check_outputs(outputs, [data, weights, recipe], overwrite)
     plan = None
     if recipe is not None:
         names = train_sequences or dataset.sequences("train")

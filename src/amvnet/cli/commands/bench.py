@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from json import dumps
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from amvnet.cli.console import progress, show
 from amvnet.cli.options import WEIGHTS, load_segmenter
@@ -19,6 +18,7 @@ def bench(
     runs: Count = 10,
     tau: Share | None = None,
     json: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Time each stage from a scan's file to its labels.
 
@@ -30,18 +30,21 @@ def bench(
         tau: the cosine similarity of the two networks' probabilities up to which points are
             uncertain, in [0, 1]; default: that of the weights.
         json: also write the figures to this file.
+        overwrite: replace this file if it exists.
     """
     from amvnet.cli.tables import timing_table
     from amvnet.data.datasets.simulated import simulate
     from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
-    from amvnet.files import atomic_write
-    from amvnet.inference.timing import time_runs
+    from amvnet.files import atomic_write, temporary_folder
+    from amvnet.inference.timing import TIMES, time_runs
+    from amvnet.outputs import check_outputs
 
+    if json is not None:
+        check_outputs({json: TIMES}, [weights, scan], overwrite)
     segmenter = load_segmenter(weights, "amvnet", compute, tau)
 
-    with TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+    with temporary_folder() as folder:
         if scan is None:
             simulate(folder, scans=1)
             scan = folder / "sequences/00/velodyne/000000.bin"

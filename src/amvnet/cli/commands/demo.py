@@ -13,21 +13,29 @@ SCANS = 3
 SEQUENCES = 3
 
 
-def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> None:
+def demo(
+    out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS, overwrite: bool = False
+) -> None:
     """Simulate streets, segment them, score the labels, and write a page that shows all in 3D.
 
     Args:
         out: folder for the scans, the page and the figures.
         seed: of the streets; the default gives streets the built-in weights were not trained on.
         weights: a weights file, or the name of a built-in one.
+        overwrite: replace the page and the figures if they exist.
     """
     from amvnet import load
     from amvnet.data.datasets.simulated import SENSORS, simulate
     from amvnet.errors import InputError
+    from amvnet.evaluation.metrics import REPORT
     from amvnet.inference.listing import list_inputs
-    from amvnet.viewing.page import write_page
+    from amvnet.outputs import check_outputs
+    from amvnet.viewing.page import PAGE, write_page
     from amvnet.viewing.shown_scans import show_scans
 
+    page = out / "index.html"
+    metrics_path = out / "metrics.json"
+    check_outputs({page: PAGE, metrics_path: REPORT}, [weights], overwrite)
     segmenter = load(weights)
     classes = segmenter.taxonomy.classes
     sensors = [name for name, taxonomy in SENSORS.items() if taxonomy.classes == classes]
@@ -45,11 +53,8 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
         )
 
     scans, taxonomy = list_inputs([str(data)], taxonomy=segmenter.taxonomy)
-    page = out / "index.html"
     with progress("segmenting") as step:
         shown = show_scans(scans, taxonomy, segmenter, progress=step)
         evaluation = write_page(page, shown, taxonomy, "Simulated streets")
-
-    metrics_path = out / "metrics.json"
     show_evaluation(evaluation, f"simulated streets, seed {seed}", metrics_path)
     say(f"labelled scans in {data}, figures in {metrics_path}; open {page} in a browser")

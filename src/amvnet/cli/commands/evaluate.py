@@ -29,6 +29,7 @@ def evaluate(
     json: Path | None = None,
     pictures: Path | None = None,
     classes: str | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
 
@@ -46,14 +47,17 @@ def evaluate(
         pictures: folder for drawings of some scans from above.
         classes: score these classes instead, to which those of the data and of the weights are
             mapped: coarse, or a YAML file.
+        overwrite: replace figures and drawings that exist.
     """
     from amvnet.data.class_maps import class_map
     from amvnet.data.datasets.open import open_dataset, open_with_classes
     from amvnet.engines.precision import choose_device
+    from amvnet.evaluation.metrics import REPORT
     from amvnet.evaluation.scoring import evaluate as evaluate_records
-    from amvnet.evaluation.scoring import label_by_weights, label_from_files
+    from amvnet.evaluation.scoring import label_by_weights, label_from_files, pictures_of
     from amvnet.files import make_folder
     from amvnet.inference.reading import normalised_for
+    from amvnet.outputs import check_outputs
     from amvnet.weights.file import load
 
     processes = join_processes()
@@ -80,10 +84,15 @@ def evaluate(
             "expected either --weights or --predictions, found both or neither; give one of them"
         )
 
-    # Before any scan is scored, so that no time is wasted if a folder cannot be made.
+    # Before any scan is scored, so that no time is wasted if a file cannot be written.
+    outputs = {} if pictures is None else pictures_of(records, pictures)
+    if json is not None:
+        outputs[json] = REPORT
+    check_outputs(outputs, [data, weights, classes], overwrite)
     for path in (json, pictures):
         if path is not None:
             make_folder(path.parent)
+    processes.wait()  # until no process takes a new drawing of another one for an old one
     with progress("scoring") as step:
         evaluation = evaluate_records(
             dataset,

@@ -19,9 +19,9 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
     """
     from amvnet.export.onnx import export as export_weights
     from amvnet.export.onnx import possible_files
-    from amvnet.files import check_free
+    from amvnet.outputs import check_outputs
 
-    check_free(possible_files(out), overwrite)
+    check_outputs(possible_files(out), [weights, int8], overwrite)
     with progress("exporting") as step:
         graphs = export_weights(weights, out, step, int8)
     say(f"{len(graphs)} graphs and amvnet.json in {out}")

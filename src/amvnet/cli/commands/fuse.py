@@ -56,7 +56,7 @@ def fuse(
         fused = fuse_files(
             inputs,
             pair,
-            OutputOptions(out, overwrite=overwrite),
+            OutputOptions(out, overwrite=overwrite, also_read=(*inputs, head)),
             choice.parse(),
             head=weights,
             tau=tau,

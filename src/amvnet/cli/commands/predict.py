@@ -103,6 +103,7 @@ def predict(
             batch=batch,
             overwrite=overwrite,
             resume=resume,
+            also_read=(*inputs, weights, labels.classes, known.sensor),
             progress=step,
             say=say,
         )

@@ -29,15 +29,16 @@ def rank(
         compute: where and how the networks are computed.
         overwrite: replace the table if it exists.
     """
-    from amvnet.files import check_free, make_folder
+    from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
+    from amvnet.outputs import check_outputs
+    from amvnet.ranking.label_errors import TABLE, write_clusters
     from amvnet.ranking.label_errors import rank as rank_records
-    from amvnet.ranking.label_errors import write_clusters
     from amvnet.weights.file import load
 
     # Before any scan is scored, so that no time is wasted.
     make_folder(out.parent)
-    check_free([out], overwrite)
+    check_outputs({out: TABLE}, [data, weights], overwrite)
     loaded = load(weights)
     dataset = open_for_weights(data, loaded)
     records = choice.records(dataset, "all")

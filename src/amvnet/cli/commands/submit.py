@@ -32,7 +32,7 @@ def submit(
         overwrite: replace the archive if it exists.
     """
     from amvnet.data.datasets.open import open_dataset
-    from amvnet.files import check_free
+    from amvnet.outputs import check_outputs
     from amvnet.submission import pack
     from amvnet.submission.rules import rules_for
 
@@ -42,7 +42,7 @@ def submit(
             f"--use-external: expected nuScenes, found {rules.taxonomy.name}; leave it out"
         )
 
-    check_free([out], overwrite)
+    check_outputs({out: pack.ARCHIVE}, [data], overwrite)
     with progress("packing") as step:
         count = pack.write(rules, predictions, out, use_external=use_external, progress=step)
     packed = counted(count, "prediction")

@@ -65,5 +65,6 @@ def train(
         bars=on_terminal(),
         processes=processes,
         scores=models.parse(),
+        also_read=(*data, init),
     )
     say(f"weights in {train_stages(plan, stage, weights)}")

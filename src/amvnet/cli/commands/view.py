@@ -23,6 +23,7 @@ def view(
     html: Path | None = None,
     scans: int = 5,
     taxonomy: Literal["semantickitti", "nuscenes"] | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Look at scans, labels, uncertain points and errors in 3D, in a browser.
 
@@ -38,14 +39,16 @@ def view(
         html: the page to write; by default a temporary one, which opens in the browser.
         scans: at most this many, evenly spaced.
         taxonomy: the classes of labels without a dataset.
+        overwrite: replace the page if it exists.
     """
     from amvnet.data.spacing import evenly_spaced
     from amvnet.data.taxonomy import TAXONOMIES
     from amvnet.files import make_folder
     from amvnet.inference.listing import list_inputs
     from amvnet.inference.reading import normaliser_for
+    from amvnet.outputs import check_outputs
     from amvnet.sensors.normalise import Normaliser
-    from amvnet.viewing.page import open_page, temporary_page, write_page
+    from amvnet.viewing.page import PAGE, open_page, temporary_page, write_page
     from amvnet.viewing.shown_scans import check_labels, show_scans
     from amvnet.weights.file import load
 
@@ -59,8 +62,9 @@ def view(
     if scans < 1:
         raise InputError(f"expected a number of scans from 1, found {scans}; say --scans 5")
     sensor = known.parse()
-    # Before any scan is segmented, so that no time is wasted if a folder cannot be made.
+    # Before any scan is segmented, so that no time is wasted if the page cannot be written.
     if html is not None:
+        check_outputs({html: PAGE}, [*inputs, labels, weights, known.sensor], overwrite)
         make_folder(html.parent)
 
     segmenter = None

@@ -195,16 +195,20 @@ class Dataset(ABC):
         folder: Path,
         ids: np.ndarray,
         taxonomy: Taxonomy | None = None,
+        count: int | None = None,
     ) -> Path:
         """Write (N,) train ids as raw ids; the file appears whole or not at all.
 
         Args:
             taxonomy: the classes of the prediction; None means those of the dataset.
+            count: N, if it is known; else it is read from the scan's file.
 
         Raises:
             InputError: if there is not one id per point, or an id is outside 0..K.
         """
-        ids = check_count(ids, record.points_path, self.count_points(record))
+        if count is None:
+            count = self.count_points(record)
+        ids = check_count(ids, record.points_path, count)
         path = inside(folder, record.prediction)
         return write_ids(path, (taxonomy or self.taxonomy).to_raw(ids), _id_type(path))
 

@@ -179,6 +179,7 @@ class NuScenes(Dataset):
         folder: Path,
         ids: np.ndarray,
         taxonomy: Taxonomy | None = None,
+        count: int | None = None,
     ) -> Path:
         """Write train ids, none of which is 0: the benchmark's server refuses points without one.
 
@@ -188,7 +189,7 @@ class NuScenes(Dataset):
         if taxonomy is None and is_lost.any() and not is_lost.all():
             classes, counts = np.unique(ids[~is_lost], return_counts=True)
             ids = np.where(is_lost, classes[counts.argmax()], ids)
-        return super().write_prediction(record, folder, ids, taxonomy)
+        return super().write_prediction(record, folder, ids, taxonomy, count)
 
     def _find_version(self, version: str | None) -> str:
         """Return the version to read: the one asked for, or the only one in the folder."""

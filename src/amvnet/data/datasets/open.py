@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from amvnet.data.datasets.base import Dataset
@@ -33,7 +34,7 @@ def open_dataset(spec: str) -> Dataset:
     """
     kind, _, rest = spec.partition(":")
     if kind in SIMULATED:
-        return SimulatedStreets(Path(rest).expanduser(), SIMULATED[kind])
+        return SimulatedStreets(Path(os.path.expanduser(rest)), SIMULATED[kind])
     if is_own(spec):
         return open_own(spec.removeprefix(f"{OWN}:"))
 
@@ -101,8 +102,8 @@ def _split_version(text: str) -> tuple[Path, str | None]:
     """Split PATH@v1.0-mini; other names with an @ stay whole."""
     path, at, version = text.rpartition("@")
     if not at or not version.startswith("v1.0-") or Path(text).exists():
-        return Path(text).expanduser(), None
-    return Path(path).expanduser(), version
+        return Path(os.path.expanduser(text)), None
+    return Path(os.path.expanduser(path)), version
 
 
 def _readers_of(path: Path) -> list[Reader]:

@@ -20,7 +20,7 @@ from amvnet.data.formats.rows import UNKNOWN, USUAL_TYPE, RowLayout
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
-from amvnet.errors import InputError, did_you_mean, errors_of, shown
+from amvnet.errors import InputError, did_you_mean, errors_of, readable, reason_of, shown
 from amvnet.files import read_yaml
 from amvnet.scan import Scan
 
@@ -218,9 +218,11 @@ class OwnScans(Dataset):
         pattern = self.description.scans
         try:
             matches = sorted(self.root.glob(pattern))
-        except (ValueError, NotImplementedError, OSError) as error:
+        except (ValueError, NotImplementedError, IndexError, OSError) as error:
+            reason = "" if isinstance(error, IndexError) else f" ({reason_of(error)[:160]})"
             raise InputError(
-                f"{self.spec}: scans: expected a pattern, found {pattern!r} ({error}); correct it"
+                f"{self.spec}: scans: expected a pattern, found {shown(pattern)}{reason}; "
+                "correct it, or root"
             ) from None
         paths = [path for path in matches if path.is_file() and not path.name.startswith(".")]
 
@@ -267,12 +269,14 @@ class OwnScans(Dataset):
 
             place = self.description.labels
             labels_path = None if place is None else place.path_of(scan.path, scan.name)
+            with readable(f"{self.spec}: labels: {shown(str(labels_path))}"):
+                has_labels = labels_path is not None and labels_path.is_file()
 
             record = ScanRecord(
                 name=name,
                 sequence=sequence,
                 points_path=scan.path,
-                labels_path=labels_path if labels_path and labels_path.is_file() else None,
+                labels_path=labels_path if has_labels else None,
                 prediction=f"{name}.label",
             )
             listing.append((record, splits[name]))
@@ -349,7 +353,7 @@ def _fixed_part(pattern: str) -> Path:
 
 def is_description(text: str) -> bool:
     """Return whether a text names a YAML file."""
-    return text.lower().endswith(ENDINGS) and Path(text).expanduser().is_file()
+    return text.lower().endswith(ENDINGS) and Path(os.path.expanduser(text)).is_file()
 
 
 def open_own(path: Path | str) -> OwnScans:
@@ -358,7 +362,7 @@ def open_own(path: Path | str) -> OwnScans:
     Raises:
         InputError: if the file cannot be read, lacks a key or has a wrong one, or there is no scan.
     """
-    path = Path(path).expanduser()
+    path = Path(os.path.expanduser(path))
     tree = read_yaml(path, "a description of scans and classes")
     with errors_of(path):
         dataset = OwnScans(_parse(path, tree))
@@ -369,7 +373,7 @@ def open_own(path: Path | str) -> OwnScans:
 def _parse(path: Path, tree: Any) -> Description:
     """Return what the YAML file says."""
     _check_keys("the file", tree, KEYS, required=("classes", "scans"))
-    root = (path.parent / Path(_text(tree, "root", ".")).expanduser()).absolute()
+    root = (path.parent / os.path.expanduser(_text(tree, "root", "."))).absolute()
 
     scans = _text(tree, "scans")
     if Path(scans).is_absolute() or ".." in Path(scans).parts:

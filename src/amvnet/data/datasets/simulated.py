@@ -20,7 +20,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError, one_line_errors, shown
-from amvnet.files import make_folder
+from amvnet.files import temporary_folder
 from amvnet.scan import Scan
 from lidarstreets import SimulationError, drive_street
 from lidarstreets import simulate as simulate_streets
@@ -165,14 +165,10 @@ class SimulatedStreets(Dataset):
 
     def _simulate(self, number: int, street: Path) -> None:
         """Simulate a street and put all its scans into the cache at once."""
-        part = street.with_name(f".{uuid.uuid4().hex}.part")
-        make_folder(part)
-        try:
+        with temporary_folder(street.parent) as part:
             for index, scan in enumerate(self._drive(number)):
                 _write(part / _name(index), scan)
             _put(part, street)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
 
         _make_room(self.root, street)
 

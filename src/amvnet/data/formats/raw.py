@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike
 
 from amvnet.data.formats.cloud import MOST_RINGS, Cloud, check_point_count
 from amvnet.data.formats.rows import ADVICE, NAMES, UNKNOWN, RowLayout, are_rings, named_cloud
-from amvnet.errors import InputError
+from amvnet.errors import InputError, readable
 
 KITTI_COLUMNS = 4  # x, y, z, intensity
 NUSCENES_COLUMNS = 5  # x, y, z, intensity 0..255, ring
@@ -83,17 +83,25 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
         InputError: if the file is missing, or its size is not a whole number of rows.
     """
     count = count_rows(path, dtype, columns)
-    return np.fromfile(path, dtype=dtype, count=count * columns).reshape(count, columns)
+    with readable(path):
+        values = np.fromfile(path, dtype=dtype, count=count * columns)
+    if len(values) < count * columns:
+        raise InputError(
+            f"{path}: expected {count} rows, found fewer: the file became shorter while it was "
+            "read; wait until it is written"
+        )
+    return values.reshape(count, columns)
 
 
 def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
     """Return the number of rows that `read_table` would read, from the size of the file."""
-    if not path.is_file():
-        raise InputError(
-            f"{path}: expected a file, found none; check the path or complete the dataset"
-        )
+    with readable(path):
+        if not path.is_file():
+            raise InputError(
+                f"{path}: expected a file, found none; check the path or complete the dataset"
+            )
+        size = path.stat().st_size
 
-    size = path.stat().st_size
     row_size = np.dtype(dtype).itemsize * columns
     if size % row_size:
         raise InputError(

@@ -26,6 +26,7 @@ import numpy as np
 
 from amvnet.data.formats.cloud import reading
 from amvnet.errors import InputError
+from amvnet.files import unfinished
 
 try:
     import resource
@@ -98,8 +99,9 @@ class _Process:
     """The process with limits, as its user sees it."""
 
     def __init__(self) -> None:
-        self._folder = mkdtemp(prefix="amvnet-")
-        environment = dict(os.environ, TMPDIR=self._folder)
+        self._folder = Path(mkdtemp(prefix="amvnet-"))
+        unfinished.add(self._folder)
+        environment = dict(os.environ, TMPDIR=str(self._folder))
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
         # One thread: each takes some of the memory.
         environment["OMP_NUM_THREADS"] = "1"
@@ -144,6 +146,7 @@ class _Process:
         cast(BinaryIO, self._popen.stdout).close()
         self._replies.close()
         shutil.rmtree(self._folder, ignore_errors=True)
+        unfinished.discard(self._folder)
         is_slow = hasattr(signal, "SIGXCPU") and code == -signal.SIGXCPU
 
         return "takes too long" if is_slow else "stops its reader"

@@ -16,7 +16,7 @@ from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, TEXT
 from amvnet.data.formats.raw import read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
-from amvnet.errors import InputError
+from amvnet.errors import InputError, readable
 
 OPEN_BAGS = 4  # that the process with limits keeps open
 
@@ -56,9 +56,10 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     Raises:
         InputError: if the file is broken, or needs a package that is missing.
     """
-    if ending in ROW_READERS:
-        return ROW_READERS[ending](path, layout)
-    return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
+    with readable(path):
+        if ending in ROW_READERS:
+            return ROW_READERS[ending](path, layout)
+        return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
 
 
 def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
@@ -105,7 +106,8 @@ def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any
             f"{path}: expected the package {' and '.join(missing)}, found none; "
             'run pip install "amvnet[formats]"'
         )
-    return call(function, path, *arguments)
+    with readable(path):
+        return call(function, path, *arguments)
 
 
 # --- in the process with limits ---

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy
-from amvnet.errors import InputError, errors_of
+from amvnet.errors import InputError, errors_of, readable
 from amvnet.files import atomic_write
 
 WIDTHS = (1, 2, 4, 8)  # bytes of the number types that labels are written in by mistake
@@ -24,12 +24,16 @@ def read_ids(path: Path, dtype: DTypeLike, count: int) -> np.ndarray:
     Raises:
         InputError: if the file is missing or has another size.
     """
-    if not path.is_file():
-        raise InputError(
-            f"{path}: expected the labels of a scan, found no file; add it, or leave the scan out"
-        )
-    check_size(path, path.stat().st_size, count, dtype)
-    return np.fromfile(path, dtype=dtype, count=count)
+    with readable(path):
+        if not path.is_file():
+            raise InputError(
+                f"{path}: expected the labels of a scan, found no file; add it, or leave the scan "
+                "out"
+            )
+        check_size(path, path.stat().st_size, count, dtype)
+        ids = np.fromfile(path, dtype=dtype, count=count)
+    check_size(path, ids.nbytes, count, dtype)  # the file may have become shorter
+    return ids
 
 
 def write_ids(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint32) -> Path:

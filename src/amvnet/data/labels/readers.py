@@ -15,7 +15,7 @@ from amvnet.data.formats.registry import COLUMN_READERS, read_columns
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.ids import check_bits, train_ids
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, readable
 
 # Types of the ids in files of nothing but ids, by bytes per point.
 INTEGERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.int64}
@@ -60,7 +60,9 @@ def read_raw_labels(
         InputError: if the file is missing or broken, lacks the field, or has another number of
             labels.
     """
-    if not path.is_file():
+    with readable(path):
+        is_file = path.is_file()
+    if not is_file:
         raise InputError(f"{path}: expected the labels of a scan, found no file; check the path")
 
     with reading(path, "labels", ADVICE):

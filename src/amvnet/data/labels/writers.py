@@ -11,11 +11,28 @@ from amvnet.data.labels.ids import check_count, write_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
+from amvnet.outputs import Signature
 
 Kind = Literal["label", "npy", "ply"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 MAX_ERROR = 0.0005  # metres: if float32 is off by more, coordinates are written as float64
+# No ids begin as files of points do.
+_IDS = rb"(?!ply|PK|\x93NUMPY|# \.PCD|VERSION|LASF|#ROSBAG|\x89MCAP|SQLite|\x1f\x8b)"
+_ARRAY = rb"\x93NUMPY.{1,20}'descr': '%s'.{1,40}'shape': \(\d+,\)"
+_PLY = (
+    rb"ply\nformat binary_little_endian 1\.0\nelement vertex \d+\nproperty (float|double) x\n.*"
+    rb"property uchar red\nproperty uchar green\nproperty uchar blue\nproperty int class\n"
+)
+# What is written for a scan, by the ending: `.bin` is that of nuScenes.
+SIGNATURES = {
+    ".label": Signature("a file of labels", _IDS, unit=4),
+    ".bin": Signature("a file of labels", _IDS),
+    ".npy": Signature("an array of labels", _ARRAY % b"[<>|][iu]\\d"),
+    ".ply": Signature("points with labels as predict writes them", _PLY),
+}
+UNCERTAIN = Signature("an array of uncertain points", _ARRAY % rb"\|b1")
+SCORES = Signature("scores of predict", rb"PK\x03\x04.{26}(rv|bev)\.npy")
 PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 
 

@@ -1,0 +1,130 @@
+"""Which files a command may write: none that it reads, and only its own kind if they exist."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from amvnet.errors import InputError
+
+HEAD = 4096  # bytes at the beginning of a file that a signature looks at
+
+
+@dataclass(frozen=True)
+class Signature:
+    """How the files of one kind begin.
+
+    Attributes:
+        name: of the kind, for messages, such as "a page of view".
+        beginning: a regular expression that matches the beginning of each such file.
+        unit: bytes; the sizes of such files are multiples of it.
+    """
+
+    name: str
+    beginning: bytes
+    unit: int = 1
+
+    def matches(self, path: Path) -> bool:
+        """Return whether a file may be of this kind. An empty file may be of any."""
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+        if not head:
+            return True
+        is_whole = path.stat().st_size % self.unit == 0
+        return is_whole and re.match(self.beginning, head, re.DOTALL) is not None
+
+
+def check_outputs(
+    outputs: Mapping[Path, Signature],
+    inputs: Iterable[Path | str | None] = (),
+    overwrite: bool = False,
+) -> None:
+    """Check that a command may write some files. Call this before the work.
+
+    No file that the command reads is written, by whatever name or link. A file that exists is
+    replaced only if the user says so, and only by one of the same kind.
+
+    Args:
+        outputs: the files, and what each of them must be if it exists and is to be replaced.
+        inputs: files that the command reads; what names no file is left out.
+        overwrite: whether the user says that files may be replaced.
+
+    Raises:
+        InputError: if one of the files may not be written.
+    """
+    existing = [path for path in outputs if os.path.lexists(path)]
+    check_not_read(existing, inputs)
+    for path in existing:
+        found = _no_file(path)
+        if found is not None:
+            raise InputError(
+                f"{path}: expected a file to write, found {found}; give the name of a file"
+            )
+
+    if existing and not overwrite:
+        more = f" (and {len(existing) - 1} more)" if len(existing) > 1 else ""
+        raise InputError(
+            f"{existing[0]}{more}: expected no file, found one; write to another place, or say "
+            "--overwrite to replace it"
+        )
+    for path in existing:
+        if path.exists() and not _matches(outputs[path], path):
+            raise InputError(
+                f"{path}: expected {outputs[path].name} to replace, found another file; write to "
+                "another place, or remove it"
+            )
+
+
+def check_not_read(outputs: Iterable[Path], inputs: Iterable[Path | str | None]) -> None:
+    """Check that no output is a file that the command reads, also by a link.
+
+    Raises:
+        InputError: if one is.
+    """
+    existing = [path for path in outputs if os.path.lexists(path)]
+    if not existing:
+        return
+
+    read: dict[tuple[int, int], Path | str] = {}
+    for source in inputs:
+        if source is not None:
+            for identity in _identities(source):
+                read[identity] = source
+    for path in existing:
+        for identity in _identities(path):
+            if identity in read:
+                raise InputError(
+                    f"{path}: expected an output that is no input, found the input "
+                    f"{read[identity]}; write to another place"
+                )
+
+
+def _identities(path: Path | str) -> Iterator[tuple[int, int]]:
+    """Yield what identifies a file, and if it is a link, also what identifies the link."""
+    for follows in (True, False):
+        with suppress(OSError, ValueError):  # nothing has this name
+            status = os.stat(path, follow_symlinks=follows)
+            if not stat.S_ISDIR(status.st_mode):
+                yield status.st_dev, status.st_ino
+
+
+def _no_file(path: Path) -> str | None:
+    """Return in words what a path is if it is neither a file nor a link to nothing."""
+    if path.is_dir():
+        return "a folder"
+    return None if path.is_file() or path.is_symlink() else "a device"
+
+
+def _matches(signature: Signature, path: Path) -> bool:
+    try:
+        return signature.matches(path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: expected {signature.name} to replace, found a file that cannot be read "
+            f"({error.strerror}); write to another place, or remove it"
+        ) from None
