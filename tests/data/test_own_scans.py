@@ -317,6 +317,41 @@ def test_mistakes_in_the_file_are_said_in_one_line(
     fails(lambda: open_own(path), path.name if word != "found none" else word, word)
 
 
+def test_a_column_of_labels_is_named_by_its_number(site: Path) -> None:
+    """Labels of Waymo are instances and classes."""
+    np.save(site / "a.npy", some_points())
+    np.save(site / "a.waymo.npy", np.column_stack([np.arange(60), RAW]))
+    labels = {"file": ".waymo.npy", "field": 1}
+    changes = {"scans": "site/a.npy", "labels": labels}
+    np.testing.assert_array_equal(only_scan(site.parent, **changes), EXPECTED)
+
+
+def test_nan_is_no_label(site: Path) -> None:
+    """CloudCompare writes it for points without a value."""
+    np.save(site / "a.npy", some_points())
+    labels = RAW.astype(np.float32)
+    labels[::5] = np.nan
+    np.save(site / "a.labels.npy", labels)
+    changes = {"scans": "site/a.npy", "labels": ".labels.npy"}
+    expected = np.where(np.arange(60) % 5, EXPECTED, 0)
+    np.testing.assert_array_equal(only_scan(site.parent, **changes), expected)
+
+
+def test_labels_that_are_true_or_false_are_1_and_0(site: Path) -> None:
+    is_car = np.arange(60) % 2 == 0
+    np.save(site / "a.npy", some_points())
+    np.save(site / "a.labels.npy", is_car)
+    changes = {
+        "scans": "site/a.npy",
+        "labels": ".labels.npy",
+        "classes": {"other": 0, "car": 1},
+        "ignored": [9],
+    }
+    np.testing.assert_array_equal(only_scan(site.parent, **changes), 2 - is_car)
+    np.save(site / "a.npy", some_points() > 0)  # no points
+    fails(lambda: only_scan(site.parent, **changes), "bool")
+
+
 def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
     np.save(site / "a.npy", some_points())
     path = site / "a.label"
@@ -327,9 +362,15 @@ def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
     fails(lambda: only_scan(site.parent), path, "found 5")
     np.save(site / "a.half.npy", np.full(60, 0.5))
     fails(lambda: read_scan_labels(site / "a.half.npy", 60, SEMANTICKITTI), "whole numbers")
-    for large in (np.inf, 2.0**40):
-        np.save(site / "a.large.npy", np.full(60, large))
-        fails(lambda: read_scan_labels(site / "a.large.npy", 60, SEMANTICKITTI), "32 bits")
+    for values, *words in (
+        (np.full(60, 2.0**40), "32 bits"),
+        (np.where(np.arange(60) < 7, 0.5, 1), "whole numbers", "found 0.5 (7 of 60"),
+        (np.where(np.arange(60) < 7, np.inf, 1), "whole numbers", "found inf (7 of 60"),
+        (np.stack([RAW, RAW], axis=1), "2 columns", "field: 1"),
+        (RAW.astype(str), "numbers"),
+    ):
+        np.save(site / "a.odd.npy", values)
+        fails(lambda: read_scan_labels(site / "a.odd.npy", 60, SEMANTICKITTI), *words)
     fails(lambda: read_scan_labels(site / "none.npy", 60, SEMANTICKITTI), "no file")
     np.save(site / "evil.npy", np.array([{}], object), allow_pickle=True)
     fails(lambda: read_scan_labels(site / "evil.npy", 1, SEMANTICKITTI), "evil.npy")

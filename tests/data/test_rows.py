@@ -50,6 +50,8 @@ def rows_of_other_layouts(table: np.ndarray) -> dict[str, bytes]:
     rng = np.random.default_rng(0)
     tables = {
         "xyz": table[:, :3],
+        "normals": np.column_stack([table[:, :3], rng.normal(0, 0.6, (len(table), 3))]),
+        "two returns": np.column_stack([table[:, :4], table[:, :4] * 1.1, table[:, 5]]),
         "times": table[:, [0, 1, 2, 3, 5]],
         "rings and times": table,
         "colours": np.column_stack([table[:, :3], rng.integers(0, 256, (len(table), 3))]),
@@ -81,6 +83,23 @@ def test_lost_and_wild_points_do_not_hide_the_columns(table: np.ndarray, tmp_pat
 
 
 @pytest.mark.parametrize("columns", [4, 5])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0])
+def test_lost_returns_may_have_any_value_that_is_no_place(
+    table: np.ndarray, tmp_path: Path, columns: int, value: float
+) -> None:
+    rows = table[:, :columns].astype("f4")
+    rows[::3, :3] = value
+    rows[::6, 3] = -1  # as simulators write for a lost return
+    rows[3::6, 3] = value
+    (tmp_path / "a.bin").write_bytes(rows.tobytes())
+
+    cloud = read_cloud(tmp_path / "a.bin")
+    np.testing.assert_array_equal(cloud.xyz, rows[:, :3])
+    scan = cloud.to_scan()
+    assert scan.valid.tolist() == [index % 3 > 0 for index in range(len(rows))]
+
+
+@pytest.mark.parametrize("columns", [4, 5])
 def test_a_truncated_file_is_not_read_with_other_columns(
     table: np.ndarray, tmp_path: Path, columns: int
 ) -> None:
@@ -95,6 +114,16 @@ def test_values_that_fit_nothing_are_refused_and_both_options_named(tmp_path: Pa
     path = tmp_path / "a.bin"
     path.write_bytes(np.random.default_rng(0).bytes(60_000))
     fails(lambda: read_cloud(path), path, "--columns x,y,z,intensity,ring", "--dtype float32")
+
+
+def test_rows_of_nothing_but_coordinates_are_asked_for_by_name(
+    table: np.ndarray, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(row_bytes(table[:, :3], "float32"))
+    fails(lambda: read_cloud(path), path, "say --columns x,y,z if the rows have no more")
+    cloud = read_cloud(path, parse_layout("x,y,z", None))
+    np.testing.assert_array_equal(cloud.xyz, table[:, :3].astype("f4"))
 
 
 def test_a_file_that_ends_within_a_row_is_called_truncated(

@@ -92,6 +92,7 @@ def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expecta
     assumed = [
         cloud.note,
         _intensity_map(cloud, estimate.quantiles, sensor, expected).text,
+        _describe_negative(cloud),
         *_describe_frame(estimate.frame, sensor),
         _describe_height(estimate.frame, sensor, expected.sensor.height),
         describe_lasers(lasers),
@@ -226,7 +227,8 @@ class Normaliser:
             self._said.add(source)
             has_intensity = cloud.intensity is not None and scale is not None
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
-            assumed = [cloud.note, intensity, f"axes {self.sensor.axes or 'x-forward'}"]
+            negative = _describe_negative(cloud)
+            assumed = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
             self._say(f"{cloud.name}: assumed {', '.join(filter(None, assumed))}")
         return scan
 
@@ -346,6 +348,15 @@ def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
             f"0,{frame.pitch:.1f},{frame.roll:.1f})"
         )
     return texts
+
+
+def _describe_negative(cloud: Cloud) -> str:
+    """Say how many points have an intensity below 0, which counts as 0; empty if none has."""
+    measured = cloud.measured_intensity()
+    if measured is None or measured.min() >= 0 or measured.max() < 0:
+        return ""
+    count = np.count_nonzero(measured < 0)
+    return f"intensity {measured.min():g} in {count:,} of {len(measured):,} points (0 instead)"
 
 
 def _describe_height(frame: Frame, sensor: Sensor, usual_height: float | None) -> str:

@@ -97,7 +97,7 @@ def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
     columns = {}
     for key, index in require_columns(names, path, wanted).items():
         columns[key] = array[..., index] if array.dtype.names is None else array[names[index]]
-        if columns[key].dtype.kind not in "fiu" or columns[key].ndim > array.ndim:
+        if columns[key].dtype.kind not in "fiub" or columns[key].ndim > array.ndim:
             raise InputError(
                 f"{path}: expected a number per point in the column {names[index]!a}, found "
                 f"{array.dtype[index]}; {ADVICE}"
@@ -159,7 +159,7 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
     else:
         shape, _, dtype = np.lib.format.read_array_header_2_0(file)
 
-    is_numeric = dtype.names is not None or dtype.kind in "fiu"
+    is_numeric = dtype.names is not None or dtype.kind in "fiub"
     if dtype.hasobject or not is_numeric or not shape:
         raise InputError(
             f"{path}: expected an array of numbers, found {dtype} of shape {shape}; "
@@ -183,10 +183,10 @@ def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
     """Return the points of a table (N, C), a range image (H, W, C) or an array of records."""
     if array.dtype.names is not None:
         return make_cloud(_columns_of(array.ravel(), path, COLUMN_NAMES), str(path))
-    if array.ndim not in (2, 3) or array.shape[-1] < 3:
+    if array.ndim not in (2, 3) or array.shape[-1] < 3 or array.dtype.kind == "b":
         raise InputError(
             f"{path}: expected numbers of shape (N, 3), (N, 4), (N, 5) or (H, W, C), "
-            f"found shape {array.shape}; save such an array"
+            f"found {array.dtype} of shape {array.shape}; save such an array"
         )
 
     if array.shape[0] <= FEW < array.shape[-1]:

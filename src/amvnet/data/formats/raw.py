@@ -16,6 +16,7 @@ KITTI_COLUMNS = 4  # x, y, z, intensity
 NUSCENES_COLUMNS = 5  # x, y, z, intensity 0..255, ring
 NUSCENES_ENDING = ".pcd.bin"
 FULL_INTENSITY = 255.0
+XYZ_BYTES = 12  # of rows of nothing but x, y, z
 KITTI_ROWS = RowLayout(NAMES[:KITTI_COLUMNS])
 NUSCENES_ROWS = RowLayout(NAMES)
 
@@ -27,6 +28,7 @@ FEW = 4800  # bytes: the values of smaller files may fit any layout
 MAX_INTENSITY = 65535  # of any device
 NEAR = 500.0  # metres: coordinates of usual scans are smaller
 USUAL = 0.999  # share of the points that must have such values; the others may be outliers
+NO_INTENSITY = -1.0  # as some tools write for a lost return; no other intensity is negative
 
 
 def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
@@ -53,6 +55,8 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         if len(data) % kitti and len(data) % nuscenes:
             found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
             advice = f"copy the file again if it is truncated, or {ADVICE}"
+        if len(data) % XYZ_BYTES == 0:
+            advice = f"say --columns x,y,z if the rows have no more, or {advice}"
         raise InputError(
             f"{path}: expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found "
             f"{found}; {advice}"
@@ -145,7 +149,7 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
 
     if not (ring == np.round(ring)).all() or not 0 <= ring.min() < ring.max() < MOST_RINGS:
         return False
-    if not (intensity >= 0).all() or np.array_equal(xyz, np.round(xyz)):
+    if not _are_intensities(intensity).all() or np.array_equal(xyz, np.round(xyz)):
         return False
     return is_named or are_rings(xyz, ring)
 
@@ -153,13 +157,23 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
 def _is_kitti(table: np.ndarray) -> bool:
     """Return whether (N, 4) values can be x, y, z and intensity.
 
-    Intensities are never negative, but some coordinates are. Lost points may be NaN.
+    Intensities are never negative, but some coordinates are. Values of lost points may not be
+    finite.
     """
     # Column by column: a reduction over rows of three takes several times as long.
     x, y, z, intensity = np.ascontiguousarray(table.T)
-    is_lost = np.isnan(x) | np.isnan(y) | np.isnan(z)
-    is_near = (np.abs(x) < NEAR) & (np.abs(y) < NEAR) & (np.abs(z) < NEAR)
-    is_intensity = np.isnan(intensity) | (intensity >= 0) & (intensity <= MAX_INTENSITY)
-    is_usual = (is_lost | is_near) & is_intensity
+    is_usual = _are_near(x, y, z) & _are_intensities(intensity)
     is_around = (x < 0).any() or (y < 0).any() or (z < 0).any()
     return bool(is_around and np.mean(is_usual) >= USUAL)
+
+
+def _are_near(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return (N,) bool: points that are lost, or as near as a sensor sees."""
+    is_lost = ~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
+    return is_lost | (np.abs(x) < NEAR) & (np.abs(y) < NEAR) & (np.abs(z) < NEAR)
+
+
+def _are_intensities(values: np.ndarray) -> np.ndarray:
+    """Return (N,) bool: values that can be intensities, also of lost points."""
+    is_possible = (values >= 0) & (values <= MAX_INTENSITY)
+    return is_possible | (values == NO_INTENSITY) | ~np.isfinite(values)

@@ -38,11 +38,17 @@ def read_scan_labels(
     Raises:
         InputError: as `read_raw_labels`, or if an id is unknown.
     """
-    return train_ids(path, read_raw_labels(path, count, field, layout), taxonomy)
+    raw = read_raw_labels(path, count, field, layout, missing=taxonomy.train_to_raw[0])
+    return train_ids(path, raw, taxonomy)
 
 
 def read_raw_labels(
-    path: Path, count: int, field: str | None = None, layout: RowLayout = UNKNOWN
+    path: Path,
+    count: int,
+    field: str | None = None,
+    layout: RowLayout = UNKNOWN,
+    *,
+    missing: int,
 ) -> np.ndarray:
     """Read (N,) raw ids from a file of labels, or from a field of the scan's file, as int64.
 
@@ -55,6 +61,7 @@ def read_raw_labels(
         field: name of the column; of `.npz`, also of an array next to the points; of arrays and
             text without names, the number of the column, from 0.
         layout: of rows without names, what they hold.
+        missing: the raw id for NaN, which CloudCompare writes for points without a label.
 
     Raises:
         InputError: if the file is missing or broken, lacks the field, or has another number of
@@ -67,6 +74,9 @@ def read_raw_labels(
 
     with reading(path, "labels", ADVICE):
         raw = _read_usual(path, count) if field is None else _read_field(path, field, layout)
+    raw = np.asarray(raw)
+    if raw.dtype.kind == "f":
+        raw = np.where(np.isnan(raw), missing, raw)
     return check_bits(path, _check(raw, path, count))
 
 
@@ -106,17 +116,28 @@ def _read_usual(path: Path, count: int) -> np.ndarray:
 
 def _check(labels: np.ndarray, path: Path, count: int) -> np.ndarray:
     """Return whole numbers, one per point, as (N,) int64."""
-    labels = np.asarray(labels).reshape(-1)
+    if labels.ndim == 2 and len(labels) == count and labels.shape[1] > 1:
+        raise InputError(
+            f"{path}: expected a label per point, found {labels.shape[1]} columns; save the column "
+            "of the classes alone, or name it by its number, such as field: 1 in the YAML file"
+        )
+
+    labels = labels.reshape(-1)
     if len(labels) != count:
         raise InputError(
             f"{path}: expected {count} labels, one per point, found {len(labels)}; "
             "give the labels of this scan"
         )
 
-    is_number = labels.dtype.kind in "fiu"
-    if not is_number or not np.array_equal(labels, np.round(labels)):
+    if labels.dtype.kind not in "fiub":
         raise InputError(
-            f"{path}: expected whole numbers as labels, found {labels.dtype} with others; {ADVICE}"
+            f"{path}: expected whole numbers as labels, found {labels.dtype}; {ADVICE}"
+        )
+    is_wrong = ~np.isfinite(labels) | (labels != np.round(labels))
+    if is_wrong.any():
+        raise InputError(
+            f"{path}: expected whole numbers as labels, found {labels[is_wrong][0]:g} "
+            f"({np.count_nonzero(is_wrong):,} of {count:,} labels are not whole); {ADVICE}"
         )
     if count and not -LARGEST <= labels.min() <= labels.max() <= LARGEST:
         raise InputError(f"{path}: expected labels of 32 bits, found larger ones; {ADVICE}")
