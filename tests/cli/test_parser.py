@@ -24,6 +24,11 @@ PREDICT = "predict a.bin --weights x --out o"
 WRONG_NAMES = {
     "predikt a.bin": "did you mean predict?",
     PREDICT + " --methd rv": "did you mean --method?",
+    PREDICT.replace("--out", "--outt"): "found --outt; did you mean --out?",
+    "view a.bin --sensor ouster": "name one of os0-32, os0-64, os0-128, os1-32, os1-64",
+    "view a.bin --sensor OS1": "name one of os1-32, os1-64, os1-128, or give a YAML file",
+    "view a.bin --sensor Velodyne": "name one of hdl64e, hdl32e, vlp16, vlp32c, vls128",
+    "view a.bin --sensor vpl16": "did you mean vlp16?",
     PREDICT + " --method amvnt": "did you mean amvnet?",
     PREDICT.replace("x", "sim-hdl64"): "did you mean sim-hdl64e?",
     TRAIN.replace("compact", "compct"): "did you mean simulated-compact?",

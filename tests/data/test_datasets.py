@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import pickle
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from amvnet.cli.options import LabelledChoice
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, VAL, NuScenes
 from amvnet.data.datasets.open import is_dataset, open_dataset
@@ -154,6 +156,22 @@ def test_unusable_labels_are_named(layout: Layout) -> None:
 
     path.unlink()
     fails(lambda: open_dataset(layout.spec).read(record), path)
+
+
+def test_nuscenes_without_labels_names_the_table_that_is_missing(tmp_path: Path) -> None:
+    spec = make_nuscenes(tmp_path).spec
+    (tmp_path / "v1.0-mini/lidarseg.json").unlink()
+    fails(partial(LabelledChoice(split="val").records, open_dataset(spec)), "lidarseg.json: ")
+
+
+@pytest.mark.parametrize("has_folder", [False, True])
+def test_a_name_without_its_ending_is_that_of_the_yaml_file(
+    tmp_path: Path, has_folder: bool
+) -> None:
+    (tmp_path / "mine.yaml").write_text("classes: {a: 1}\n")
+    if has_folder:
+        (tmp_path / "mine").mkdir()
+    fails(lambda: open_dataset(str(tmp_path / "mine")), f"did you mean {tmp_path}/mine.yaml?")
 
 
 def test_lost_returns_of_nuscenes_get_the_most_frequent_class_in_files(tmp_path: Path) -> None:

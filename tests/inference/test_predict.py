@@ -367,6 +367,21 @@ def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) 
 ENTRIES = [Entry(name, "0f", "drive", 10, 3) for name in "ab"]
 
 
+def test_the_folder_of_another_run_is_named_in_a_warning(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = world / "scans/000000.bin"
+    command = f"--weights {world}/{WEIGHTS} --out {tmp_path}"
+    succeed(f"predict {scan} {command}")
+    assert "earlier run" not in capsys.readouterr().out
+    succeed(f"predict {scan} {command} --overwrite --method rv")  # leaves nothing of the other
+    assert "earlier run" not in capsys.readouterr().out
+
+    succeed(f"predict {world}/scans/000001.bin {command}")
+    warning = "the labels of 1 scan of an earlier run, made with another method; give each run"
+    assert warning in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("text", "done"),
     [

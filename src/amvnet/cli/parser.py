@@ -42,6 +42,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # also -1,0,0 is no option
         self.kinds: dict[str, Any] = {}  # types of the values, by name
+        self._words: Sequence[str] = ()  # what is being parsed
 
     def error(self, message: str) -> NoReturn:
         line = " ".join(message.split())
@@ -50,7 +51,10 @@ class Parser(argparse.ArgumentParser):
         if unknown is not None:
             line = self._unknown(unknown[1])
         elif missing is not None:
+            # A wrong name of the missing option says more than that it is missing.
+            wrong = self._wrong_option()
             line = f"expected {missing[1]}, found none; add what is missing"
+            line = line if wrong is None else self._unknown(wrong)
         raise InputError(line if line.endswith("?") else f"{line}; see {self.prog} --help")
 
     def print_help(self, file: Any = None) -> None:
@@ -62,18 +66,32 @@ class Parser(argparse.ArgumentParser):
         Raises:
             InputError: if an argument is missing or unknown, or a value is not of its type.
         """
+        self._words = arguments
         values = vars(self.parse_args(arguments))
         for name, kind in self.kinds.items():
             if isinstance(values[name], str):
                 values[name] = _convert(flag_of(name), values[name], kind)
         return values
 
+    def _flags(self) -> list[str]:
+        """Return the names of all options."""
+        return [known for action in self._actions for known in action.option_strings]
+
+    def _wrong_option(self) -> str | None:
+        """Return the first word that looks like an option and is none."""
+        for word in self._words:
+            if word == "--":
+                break
+            if word.startswith("--") and word.split("=")[0] not in self._flags():
+                return word
+        return None
+
     def _unknown(self, words: str) -> str:
         word = words.split()[0]
         if not word.startswith("-"):
             return f"expected nothing more, found {words}; leave it out"
         flag = word.split("=")[0]
-        flags = [known for action in self._actions for known in action.option_strings]
+        flags = self._flags()
         return f"expected an option of {self.prog}, found {flag}{did_you_mean(flag, flags)}"
 
 

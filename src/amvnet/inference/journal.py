@@ -5,13 +5,14 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from amvnet.errors import InputError
 from amvnet.files import PARTS, atomic_write, make_folder
+from amvnet.progress import counted
 
 JOURNAL = ".amvnet-journal.jsonl"  # of a run that has ended
 UNFINISHED = ".unfinished.jsonl"  # until the run ends
@@ -101,6 +102,29 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
         for entry in entries:
             done[entry.scan] = entry
     return done
+
+
+def describe_other_run(folder: Path, settings: Mapping[str, Any], scans: Set[str]) -> str:
+    """Say what an earlier run left in a folder that a run is about to write into; empty if nothing.
+
+    Args:
+        settings: of the run, as for `Journal`.
+        scans: the names of its scans, whose files it replaces.
+    """
+    others: set[str] = set()
+    changed: set[str] = set()
+    for path in (folder / JOURNAL, folder / UNFINISHED):
+        if path.is_file():
+            earlier_settings, entries = _read(path)
+            others |= {entry.scan for entry in entries} - scans
+            changed |= {key for key in settings if settings[key] != earlier_settings.get(key)}
+    if not others:
+        return ""
+
+    text = f"{folder} has the labels of {counted(len(others), 'scan')} of an earlier run"
+    if changed:
+        text += f", made with another {', '.join(sorted(changed))}"
+    return f"{text}; give each run a folder of its own"
 
 
 def check_settings(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.inference.journal import Entry
+from amvnet.inference.journal import Entry, describe_other_run
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import Pipeline, Segment, check_faults
 from amvnet.inference.reading import normaliser_for
@@ -85,6 +85,11 @@ def predict(
         batch=batch,
         at_once=segmenter.at_once,
     )
+    if not resume:
+        names = {str(scan.scores_path) for scan in scans}
+        other_run = describe_other_run(folder, request.settings, names)
+        if other_run:
+            say(f"warning: {other_run}")
     entries, faults = pipeline.run(request.settings, progress)
 
     if METHODS[segmenter.method].has_two_networks:

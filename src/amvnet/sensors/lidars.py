@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.errors import InputError, errors_of, shown
+from amvnet.errors import InputError, did_you_mean, errors_of, shown
 from amvnet.files import read_yaml
 
 # Metres over the ground on the cars that recorded KITTI and nuScenes.
@@ -29,6 +29,13 @@ AXES = {
 }
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # metres
 Triple = tuple[float, float, float]
+# How the names of a maker's LiDARs begin.
+MAKERS = {
+    "velodyne": ("hdl", "vlp", "vls"),
+    "ouster": ("os",),
+    "hesai": ("pandar", "xt"),
+    "robosense": ("rs",),
+}
 LARGEST = 1e9  # of the numbers that describe a sensor
 
 
@@ -175,9 +182,15 @@ def _read_sensor(text: str) -> Sensor:
 
     path = Path(text)
     if path.suffix not in (".yaml", ".yml"):
+        models = _models_of(text)
+        if models:
+            raise InputError(
+                f"expected the model of a LiDAR, found {shown(text)}; name one of "
+                f"{', '.join(models)}, or give a YAML file"
+            )
         raise InputError(
-            f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {shown(text)}; "
-            "give one of them"
+            f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {shown(text)}"
+            f"{did_you_mean(text, SENSORS, 'give one of them')}"
         )
 
     tree = read_yaml(path, "a description of a sensor")
@@ -187,6 +200,12 @@ def _read_sensor(text: str) -> Sensor:
         )
     with errors_of(path):
         return make_sensor({"name": path.stem, **tree})
+
+
+def _models_of(text: str) -> list[str]:
+    """Return the known LiDARs of a maker, or those whose names begin in the same way."""
+    beginnings = MAKERS.get(text.lower(), (text.lower(),))
+    return [name for name in SENSORS if text and name.startswith(beginnings)]
 
 
 def _to_triple(value: Any) -> Any:

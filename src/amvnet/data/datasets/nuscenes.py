@@ -169,6 +169,15 @@ class NuScenes(Dataset):
         assert self._category_train_ids is not None  # no record has labels without this table
         return self._category_train_ids
 
+    def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+        """Return the scans; raise InputError if the tables have no labels at all."""
+        if not self._label_files:
+            raise InputError(
+                f"{self.root / self.version / 'lidarseg.json'}: expected the table of the labels, "
+                "found none; unpack nuScenes-lidarseg into the same folder"
+            )
+        return list(records)
+
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""
         return count_rows(record.points_path, np.float32, NUSCENES_COLUMNS)

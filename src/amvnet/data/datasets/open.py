@@ -7,7 +7,7 @@ from pathlib import Path
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
-from amvnet.data.datasets.own import OwnScans, is_description, open_own
+from amvnet.data.datasets.own import ENDINGS, OwnScans, is_description, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.simulated import SENSORS, SimulatedStreets
 from amvnet.data.taxonomy import Taxonomy, describe_difference
@@ -40,7 +40,9 @@ def open_dataset(spec: str) -> Dataset:
 
     path, version = _split_version(rest if kind in READERS else spec)
     if not path.is_dir():
-        raise InputError(f"{path}: expected the folder of a dataset, found none; check the path")
+        raise InputError(
+            f"{path}: expected the folder of a dataset, found none{_or_description(path)}"
+        )
 
     reader = READERS[kind] if kind in READERS else _guess_reader(path)
     if issubclass(reader, NuScenes):
@@ -98,6 +100,15 @@ def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
         )
 
 
+def _or_description(path: Path, advice: str = "check the path") -> str:
+    """Return the end of a message: the YAML file that is meant by a name without its ending."""
+    for ending in ENDINGS:
+        described = path.with_name(path.name + ending) if path.name else path
+        if is_description(str(described)):
+            return f"; did you mean {described}?"
+    return f"; {advice}"
+
+
 def _split_version(text: str) -> tuple[Path, str | None]:
     """Split PATH@v1.0-mini; other names with an @ stay whole."""
     path, at, version = text.rpartition("@")
@@ -120,5 +131,5 @@ def _guess_reader(path: Path) -> Reader:
     choices = " or ".join(f"{kind}:PATH" for kind in READERS)
     raise InputError(
         f"{path}: expected either sequences/XX/velodyne (SemanticKITTI) or v1.0-*/sample_data.json "
-        f"(nuScenes), found {found}; write {choices}"
+        f"(nuScenes), found {found}{_or_description(path, f'write {choices}')}"
     )
