@@ -24,7 +24,7 @@ from amvnet.data.palette import WRONG, class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.evaluation.scoring import labels_by_method
 from amvnet.viewing import page as pages
-from amvnet.viewing.shown_scans import RIGHT, ShownScan
+from amvnet.viewing.shown_scans import RIGHT, ShownScan, shown_scan
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page, with_script
@@ -136,6 +136,20 @@ def test_the_page_has_the_probabilities_of_every_method(
     shares = np.sort(shares, axis=1)
     np.testing.assert_allclose(planes["second-probability"] / 100, shares[:, -2], atol=0.006)
     assert (planes["second"] != planes["amvnet"]).mean() > 0.99  # unless two classes are equal
+
+
+def test_the_page_is_as_sure_as_the_result(dataset: SemanticKitti, world: Path) -> None:
+    """Also of points to which both networks together give no score."""
+    segmenter = amvnet.load(world / "w.safetensors")
+    result = segmenter(dataset.read(dataset.records(["00"])[0]))
+    scores = result.scores.copy()
+    scores[:5] = 0
+    result = replace(result, scores=scores)
+
+    shown = shown_scan(result, result.require_origin())
+    sure = shown.probabilities[result.require_origin().method]
+    np.testing.assert_allclose(sure, result.confidence, atol=1e-6)
+    assert (sure[:5] > 0).all()
 
 
 def test_the_table_of_the_page_is_that_of_evaluate(world: Path, tmp_path: Path) -> None:

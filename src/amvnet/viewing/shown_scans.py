@@ -156,5 +156,7 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
 
 
 def _shares(scores: Tensor) -> Tensor:
-    """Scale the rows of scores (P, K) so that they sum to 1: a geometric mean does not."""
-    return scores / scores.sum(dim=1, keepdim=True).clamp(min=1e-12)
+    """Scale the rows of scores (P, K) of valid points as `Segmentation.probabilities` does."""
+    sums = scores.sum(dim=1, keepdim=True)
+    # Two networks that are wholly sure of different classes leave no score at all.
+    return torch.where(sums > 0, scores / sums, torch.tensor(1 / max(scores.shape[1], 1)))
