@@ -30,7 +30,7 @@ def on_post_build(config: Any, **_: Any) -> None:
     page = Path(config.site_dir) / LIVE
     with TemporaryDirectory() as folder:
         data = amvnet.simulate(Path(folder) / "street", sequences=1, scans=2, seed=SEED)
-        view = ["view", str(data), "--weights", "sim-hdl64e", "--html", str(page)]
+        view = ["view", str(data), "--weights", "sim-hdl64e", "--html", str(page), "--overwrite"]
         with redirect_stdout(io.StringIO()):
             code = main(view)
     if code != DONE:
