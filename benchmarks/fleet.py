@@ -1,12 +1,12 @@
-"""Check and time `predict --ray` on simulated scans in an S3 server on this machine.
+"""Check and time `amvnet fleet` on simulated scans in an S3 server on this machine.
 
     python benchmarks/fleet.py [--scans 400] [--workers 2]
     python benchmarks/fleet.py --names 10000000
 
-The first prints what `predict` and `--ray` take to start and for each scan, from files; then it
+The first prints what `predict` and `fleet` take to start and for each scan, from files; then it
 compares the labels in a bucket with those of `predict`, also after a worker and the driver are
-killed. The second lists and plans made-up names, and prints the memory that it takes. Needs
-the packages of `make test-slow`.
+killed. The second plans a manifest of made-up names, twice, and prints the memory that it takes.
+Needs the packages of `make test-slow`.
 """
 
 from __future__ import annotations
@@ -19,16 +19,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from io import BytesIO
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet
-from pyarrow.fs import FileType
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from fixtures.s3_server import Bucket, s3_server
@@ -67,11 +65,9 @@ def compare(root: Path, bucket: Bucket, scans: int, workers: int) -> None:
 
     for name in ("few", "scans"):
         alone = amvnet("predict", f"{root / name}/*/*.bin", *TO, root / f"{name}-alone")
-        on_ray = amvnet(
-            *("predict", root / name, *TO, root / f"{name}-ray"), "--workers", workers, "--ray"
-        )
+        on_ray = amvnet("fleet", root / name, *TO, root / f"{name}-ray", "--workers", workers)
         count = len(list((root / name).rglob("*.bin")))
-        print(f"{count} files: predict {alone:.1f} s, --ray {on_ray:.1f} s", flush=True)
+        print(f"{count} files: predict {alone:.1f} s, fleet {on_ray:.1f} s", flush=True)
         if name == "few":
             few = (count, alone, on_ray)
     print_costs(few, (count, alone, on_ray))
@@ -90,15 +86,15 @@ def print_costs(few: tuple[int, float, float], many: tuple[int, float, float]) -
     """Print what a run takes at its start, and what each scan takes.
 
     Args:
-        few, many: the number of scans, and the seconds of `predict` and of `--ray`.
+        few, many: the number of scans, and the seconds of `predict` and of `fleet`.
     """
     slopes = []
-    for name, column in (("predict", 1), ("--ray", 2)):
+    for name, column in (("predict", 1), ("fleet", 2)):
         slope = (many[column] - few[column]) / (many[0] - few[0])
         start = few[column] - slope * few[0]
         print(f"{name}: {start:.1f} s + {slope:.4f} s a scan")
         slopes.append(slope)
-    print(f"--ray: {slopes[1] / slopes[0] - 1:+.1%} a scan, {many[2] / many[1] - 1:+.1%} in all")
+    print(f"fleet: {slopes[1] / slopes[0] - 1:+.1%} a scan, {many[2] / many[1] - 1:+.1%} in all")
 
 
 def amvnet(*words: object) -> float:
@@ -120,9 +116,8 @@ def in_bucket(
     Args:
         kill: kills something when a quarter of the labels is there.
     """
-    words = ["s3://fleet/scans", *TO, f"s3://fleet/{out}", *more]
-    words += ["--workers", str(workers), "--ray"]
-    command = [sys.executable, "-m", "amvnet", "predict", *words]
+    words = ["s3://fleet/scans", *TO, f"s3://fleet/{out}", "--workers", str(workers), *more]
+    command = [sys.executable, "-m", "amvnet", "fleet", *words]
     start = time.perf_counter()
     process = subprocess.Popen(command)
     if kill is not None:
@@ -139,7 +134,7 @@ def kill_worker(driver: subprocess.Popen[bytes]) -> None:
     listing = subprocess.run(["ps", "-eo", "pid,args"], capture_output=True, text=True, check=True)
     for line in listing.stdout.splitlines():
         pid, _, title = line.strip().partition(" ")
-        if title.startswith("ray::") and "LabelScans" in title:
+        if title.startswith("ray::") and "Worker" in title:
             os.kill(int(pid), signal.SIGKILL)
             return
 
@@ -166,47 +161,56 @@ def check(folder: Path, bucket: Bucket, out: str) -> None:
 
 
 def plan(names: int) -> None:
-    """List and plan made-up names in drives of a thousand, as the driver does before it labels."""
-    from amvnet.fleet import cluster
-    from amvnet.fleet.actors import Labelling
-    from amvnet.fleet.cluster import FleetRun
-    from amvnet.fleet.manifest import list_blocks
-    from amvnet.fleet.results import Results, describe_drive
+    """Plan a manifest of made-up names in drives of a thousand, as the driver does.
+
+    A second time, all of them are done.
+    """
+    from amvnet.fleet.manifest import list_scans
+    from amvnet.fleet.on_ray import Cluster, FleetRun, _windows
+    from amvnet.fleet.results import Results, results_schema
     from amvnet.fleet.storage import Place
+    from amvnet.inference.request import LabellingRequest
     from amvnet.weights.file import load
 
-    class Measuring:
-        """Workers that find nothing to measure."""
-
-        def run(self, method: str, tables: list[pa.Table]) -> Iterator[tuple[pa.Table, Any]]:
-            for table in tables:
-                yield table, describe_drive(table["drive"][0].as_py(), "", None)
-
-    class MadeUp(Place):
-        def kind(self) -> FileType:
-            return FileType.Directory
-
-        def children(self) -> tuple[list[str], list[str]]:
-            if self.url == "s3://fleet":
-                return [], [f"car-{index:06d}" for index in range(names // DRIVE)]
-            return [f"{1_700_000_000_000_000 + index}.bin" for index in range(DRIVE)], []
-
-        def __truediv__(self, name: str) -> Place:
-            return MadeUp(f"{self.url}/{name}", self.filesystem, "")
-
     with TemporaryDirectory() as folder:
-        labelling = Labelling(load(WEIGHTS), folder)
-        run = FleetRun(labelling, Results(Place.of(folder), {}), Measuring())  # type: ignore[arg-type]
-        Place.of = classmethod(lambda cls, url: MadeUp(url, None, ""))  # type: ignore[method-assign, assignment]
-        before = peak()
-        start = time.perf_counter()
-        total = 0
-        blocks = list_blocks(["s3://fleet"])
-        while window := list(islice(blocks, cluster.WINDOW)):
-            total += sum(map(len, run.plan(window)))
-            run.measure()
-        seconds = time.perf_counter() - start
-    print(f"{total:,} names in {seconds:.0f} s; peak memory {peak():.2f} GB, {before:.2f} before")
+        manifest = f"{folder}/fleet.parquet"
+        schema = pa.schema({"path": pa.string(), "drive": pa.string()})
+        with pa.parquet.ParquetWriter(manifest, schema) as writer:
+            for drive in range(names // DRIVE):
+                paths = [f"/car-{drive:06d}/{10**15 + index}.bin" for index in range(DRIVE)]
+                values = [paths, [f"car-{drive:06d}"] * DRIVE]
+                writer.write_table(pa.table(values, schema=schema))
+
+        request = LabellingRequest(load(WEIGHTS))
+        out = Place.of(f"{folder}/out")
+        for resume in (False, True):
+            before = peak()
+            start = time.perf_counter()
+            results = Results(out, request, resume=resume)
+            run = FleetRun(request, results, Cluster(), {})
+            remaining = 0
+            for window in _windows(list_scans([manifest], out)):
+                scans = run.plan(window)
+                remaining += len(scans)
+                if len(scans):
+                    write_results(results, scans, results_schema(request.taxonomy))
+            results.flush()
+            seconds = time.perf_counter() - start
+            print(
+                f"{names:,} names, {remaining:,} to label, in {seconds:.0f} s; "
+                f"peak memory {peak():.2f} GB, {before:.2f} before"
+            )
+
+
+def write_results(results: Any, scans: pa.Table, schema: pa.Schema) -> None:
+    """Write empty label files of scans, and their rows."""
+    for name in scans["name"].to_pylist():
+        path = Path(f"{results.out.path}/{name}.label")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    columns = {"scan": scans["name"], "drive": scans["drive"], "path": scans["path"]}
+    values = [columns.get(field.name, pa.nulls(len(scans), field.type)) for field in schema]
+    results.add(pa.table(values, schema=schema))
 
 
 def peak() -> float:

@@ -31,6 +31,32 @@ def shown(value: object) -> str:
     return text.repr(value)
 
 
+# The user name and password of a URL; a password may hold slashes that should have been escaped.
+CREDENTIALS = re.compile(r"(\w+)://(?:([^/\s]*)|[^/\s@:]+:(?!\d+/)\S*)@")
+CONTAINERS = ("abfs", "abfss", "wasb", "wasbs")  # schemes of URLs with CONTAINER@ACCOUNT
+# The parameters of a URL that prove who asks: keys, tokens, signatures.
+SECRET_PARAMETERS = re.compile(
+    r"([?&][^?&=\s]*(?:key|secret|token|sig|signature|password|credential)[^&=\s]*=)[^&\s]+",
+    re.IGNORECASE,
+)
+
+
+def without_secrets(text: str) -> str:
+    """Return a text without the user names, passwords and keys of the URLs in it.
+
+    Every URL passes through here before it is shown or stored.
+    """
+    if "://" not in text:
+        return text
+    return SECRET_PARAMETERS.sub(r"\1...", CREDENTIALS.sub(_without_credentials, text))
+
+
+def _without_credentials(match: re.Match[str]) -> str:
+    scheme, user = match.groups()
+    is_container = scheme in CONTAINERS and user is not None and ":" not in user
+    return match[0] if is_container else f"{scheme}://"
+
+
 def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") -> str:
     """Return the end of an error message: the most similar name, or else what to do.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tracemalloc
 from collections.abc import Sequence
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +12,23 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
-from pyarrow.fs import FileType
+from pyarrow.fs import FileType, LocalFileSystem
 
-from amvnet.data.formats.find import list_scans
+from amvnet.data.formats import find
+from amvnet.errors import InputError
 from amvnet.fleet import manifest
-from amvnet.fleet.manifest import BLOCK, NameSet, list_blocks
+from amvnet.fleet.manifest import NameSet, list_scans
 from amvnet.fleet.storage import Place
 
 from fixtures.s3_server import Bucket
 from fixtures.worlds import fails
 
+NOWHERE = "/an/output/folder/elsewhere"
 
-def scans_of(inputs: Sequence[str]) -> list[tuple[str, str, str]]:
+
+def scans_of(inputs: Sequence[str], out: str = NOWHERE) -> list[tuple[str, str, str]]:
     """Return the name, the drive and the URL of each scan."""
-    rows = [row for block in list_blocks(inputs) for row in block.to_pylist()]
+    rows = [row for table in list_scans(inputs, Place.of(out)) for row in table.to_pylist()]
     return [(row["name"], row["drive"], row["path"]) for row in rows]
 
 
@@ -41,7 +43,7 @@ def touch(root: Path, *names: str) -> None:
 
 def test_a_folder_of_drives_is_listed_as_predict_lists_its_files(fleet: Path) -> None:
     expected = []
-    for scan in list_scans(f"{fleet}/scans/*/*.bin"):
+    for scan in find.list_scans(f"{fleet}/scans/*/*.bin"):
         expected.append((scan.name, scan.source, str(scan.path)))
     assert scans_of([f"{fleet}/scans"]) == expected
 
@@ -63,21 +65,13 @@ def test_only_scans_are_listed_and_those_of_other_formats_are_another_drive(tmp_
     assert drives == expected
 
 
-def test_blocks_are_of_one_drive_and_keep_its_order(tmp_path: Path) -> None:
-    names = [f"{index:03d}.bin" for index in range(2 * BLOCK + 1)]
-    touch(tmp_path, *(f"{drive}/{name}" for drive in "ab" for name in names))
-    blocks = list(list_blocks([str(tmp_path)]))
-    assert [len(block) for block in blocks] == 2 * [BLOCK, BLOCK, 1]
-    assert pa.concat_tables(blocks[:3])["name"].to_pylist() == [f"a/{name[:-4]}" for name in names]
-
-
 def test_what_cannot_be_listed_is_refused_in_one_line(tmp_path: Path, bucket: Bucket) -> None:
     (tmp_path / "empty").mkdir()
     touch(tmp_path, "bags/drive.mcap")
     for text, words in (
         (tmp_path / "none", ("found nothing",)),
         (tmp_path / "empty", ("found none", "folder of scans")),
-        (tmp_path / "bags", ("drive.mcap", "recording", "without --ray")),
+        (tmp_path / "bags", ("drive.mcap", "recording", "amvnet predict")),
         ("s3://fleet/none", ("found nothing", "check the URL")),
         ("nowhere://fleet", ("nowhere", "s3://")),
     ):
@@ -107,24 +101,107 @@ def test_a_manifest_of_paths_gives_the_same_scans_as_the_folder(fleet: Path, end
 
 
 @pytest.mark.parametrize("ending", manifest.MANIFESTS)
-def test_rows_of_a_manifest_are_brought_together_by_drive(tmp_path: Path, ending: str) -> None:
+def test_columns_of_a_manifest_are_texts(tmp_path: Path, ending: str) -> None:
     columns = {
-        "path": [f"s3://b/x/{index}.bin" for index in range(6)],
-        "drive": ["a", "b"] * 3,
-        "name": [f"{index:06d}" for index in range(6)],  # digits, but no numbers
+        "path": [f"s3://b/x/{index}.bin" for index in range(2)],
+        "drive": ["7", "8"],
+        "name": ["000000", "000001"],  # digits, but no numbers
     }
-    a, b = list_blocks([write_manifest(tmp_path / f"m{ending}", columns)])
-    assert a["drive"].to_pylist() == ["a"] * 3
-    assert a["name"].to_pylist() == ["000000", "000002", "000004"]
-    assert b["drive"].to_pylist() == ["b"] * 3
-    assert b["path"][0].as_py() == "s3://b/x/1.bin"
+    rows = scans_of([write_manifest(tmp_path / f"m{ending}", columns)])
+    assert rows == [("000000", "7", "s3://b/x/0.bin"), ("000001", "8", "s3://b/x/1.bin")]
+
+
+def test_names_of_one_file_are_one_name(tmp_path: Path) -> None:
+    names = ["x/a", "x//a", "./x/a", "x/./a", "x/a/"]
+    path = write_manifest(tmp_path / "m.csv", {"path": ["a.bin"] * 5, "name": names})
+    assert {name for name, _, _ in scans_of([path])} == {"x/a"}
 
 
 def test_a_manifest_without_paths_is_refused_in_one_line(tmp_path: Path) -> None:
     path = write_manifest(tmp_path / "m.csv", {"file": ["a.bin"]})
-    fails(lambda: list(list_blocks([path])), "column path", "found file")
+    fails(lambda: scans_of([path]), "column path", "found file")
     (tmp_path / "m.parquet").write_bytes(b"PAR1, but no more")
-    fails(lambda: list(list_blocks([f"{tmp_path}/m.parquet"])), "m.parquet")
+    fails(lambda: scans_of([f"{tmp_path}/m.parquet"]), "m.parquet", "Parquet or CSV")
+
+
+@pytest.mark.parametrize("ending", manifest.MANIFESTS)
+def test_a_manifest_with_a_column_twice_or_a_row_without_a_path_is_refused_in_one_line(
+    tmp_path: Path, ending: str
+) -> None:
+    path = tmp_path / f"m{ending}"
+    twice = pa.Table.from_arrays([pa.array(["a.bin"]), pa.array(["b.bin"])], ["path", "path"])
+    missing = pa.table({"path": ["a.bin", None], "name": ["a", "b"]})
+    for table, words in (
+        (twice, ("one column path", "found 2")),
+        (missing, ("a path in each row",)),
+    ):
+        if ending == ".csv":
+            pa.csv.write_csv(table, path)
+        else:
+            pa.parquet.write_table(table, path)
+        fails(lambda: scans_of([str(path)]), path, *words)
+
+
+# ---- the output folder
+
+
+def test_an_output_folder_among_the_inputs_is_refused_also_through_links(tmp_path: Path) -> None:
+    touch(tmp_path, "scans/a.bin", "out/old.ply")
+    (tmp_path / "link").symlink_to(tmp_path / "scans")
+    (tmp_path / "scans/loop").symlink_to(tmp_path / "out")
+    path = write_manifest(tmp_path / "m.csv", {"path": [f"{tmp_path}/scans/loop/old.ply"]})
+    for inputs, out in (
+        ("scans", "scans"),
+        ("scans", "scans/out"),
+        ("scans", "link"),
+        ("scans", "link/out"),
+        ("link", "scans"),
+        (".", "out"),
+        ("scans", "out"),  # holds a link to it
+        ("out/old.ply", "out"),
+        ("scans/loop/old.ply", "out"),
+    ):
+        call = partial(scans_of, [f"{tmp_path}/{inputs}"], f"{tmp_path}/{out}")
+        fails(call, "change --out")
+    fails(partial(scans_of, [path], f"{tmp_path}/out"), "change --out")
+    assert len(scans_of([f"{tmp_path}/scans"], f"{tmp_path}/scans-out")) == 2
+
+
+def test_an_output_prefix_among_the_inputs_is_refused(bucket: Bucket) -> None:
+    for inputs, out in (
+        ("s3://fleet/scans", "s3://fleet/scans/"),
+        ("s3://fleet/scans", "s3://anybody:anything@fleet/scans/out"),
+        ("s3://fleet/scans/drive0/000000.bin", "s3://fleet/scans/drive0"),
+    ):
+        fails(partial(scans_of, [inputs], out), "change --out")
+    assert scans_of(["s3://fleet/scans"], "s3://fleet/scans-out")
+
+
+# ---- secrets
+
+
+def test_credentials_are_in_the_paths_for_the_workers_only(
+    bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    own = "s3://anybody:pass%2Fword@fleet"
+    path = write_manifest(tmp_path / "m.csv", {"path": [f"{own}/scans/drive0/000000.bin"]})
+    for text in (f"{own}/scans/drive0", path, f"{own}/scans/drive0/000000.bin"):
+        name, drive, url = scans_of([text])[0]
+        assert name.endswith("000000")
+        assert drive == "s3://fleet/scans/drive0/*.bin"
+        assert url.startswith(own)
+    for text, out in (
+        (f"{own}/none", NOWHERE),
+        (f"{own}/scans", f"{own}/scans"),
+        ("s3://anybody:pass%2Fword@none/x", NOWHERE),
+        ("nowhere://anybody:pass/word@none/x", NOWHERE),
+    ):
+        with pytest.raises(InputError) as caught:
+            scans_of([text], out)
+        assert "anybody" not in str(caught.value)
+        assert "word" not in str(caught.value)
 
 
 # ---- many names
@@ -159,33 +236,32 @@ class MadeUp(Place):
         return FileType.Directory
 
     def children(self) -> tuple[list[str], list[str]]:
-        if self.url == "/fleet":
+        if self.path == "/fleet":
             return [], [f"drive-{index:06d}" for index in range(self.drives)]
         return [f"{1_700_000_000_000_000 + index}.bin" for index in range(DRIVE)], []
 
     def __truediv__(self, name: str) -> Place:
-        return MadeUp(f"{self.url}/{name}", self.filesystem, f"{self.path}/{name}")
+        return MadeUp(f"{self.address}/{name}", self.filesystem, f"{self.path}/{name}")
 
 
 def test_the_memory_of_planning_does_not_grow_with_the_names(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Of each name stay 8 bytes."""
-    monkeypatch.setattr(Place, "of", lambda url: MadeUp(url, None, url))
+    monkeypatch.setattr(Place, "of", lambda url: MadeUp(url, LocalFileSystem(), url))
 
-    def peak(drives: int) -> int:
+    def kept(drives: int) -> int:
         monkeypatch.setattr(MadeUp, "drives", drives)
         names = NameSet()
         tracemalloc.start()
-        blocks = list_blocks(["/fleet"])
-        while window := list(islice(blocks, 20)):
-            assert names.add(pa.concat_tables(window)["name"].to_pylist()).all()
-        size = tracemalloc.get_traced_memory()[1]
+        for table in list_scans(["/fleet"], Place.of("/out")):
+            assert names.add(table["name"].to_pylist()).all()
+            snapshot = tracemalloc.take_snapshot() if len(names) == drives * DRIVE else None
         tracemalloc.stop()
-        assert len(names) == drives * DRIVE
-        return size
+        # Python enlarges its table of interned strings at times that differ.
+        assert snapshot is not None
+        own = snapshot.filter_traces([tracemalloc.Filter(False, "*/pathlib.py")])
+        return sum(trace.size for trace in own.traces)
 
-    few = peak(20)
-    # Python may enlarge its table of interned strings meanwhile, but not twice.
-    many = min(peak(100), peak(100))
-    assert (many - few) / (80 * DRIVE) < 40
+    few = kept(20)
+    assert (kept(100) - few) / (80 * DRIVE) < 20

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,11 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-import amvnet
-from amvnet.fleet.actors import Labelling, LabelScans
-from amvnet.fleet.manifest import list_blocks
+from amvnet.fleet.labelling import IS_FATAL, LabelScans, MeasureSensors
+from amvnet.fleet.manifest import list_scans
 from amvnet.fleet.results import DRIVES, Results
 from amvnet.fleet.storage import Place
+from amvnet.inference.request import LabellingRequest
 from amvnet.weights.file import load
 
 PAGE = (Path(__file__).parents[2] / "docs/fleet.md").read_text()
@@ -25,15 +24,16 @@ PAGE = (Path(__file__).parents[2] / "docs/fleet.md").read_text()
 def world(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with `labels/results` as of a run, and a manifest."""
     root = tmp_path_factory.mktemp("page")
-    labelling = Labelling(load(fleet / "w.safetensors"), str(root / "labels"))
-    results = Results(Place.of(labelling.out), labelling.settings)
-    worker = LabelScans(labelling)
-    for block in list_blocks([f"{fleet}/scans"]):
-        drive = worker.measure(block)
-        results.add_drives([drive])
-        estimates = pa.repeat(drive["estimates"], len(block))
-        rows = worker(block.append_column("estimates", estimates))
-        results.add(rows.drop_columns(["is_fatal"]))
+    request = LabellingRequest(load(fleet / "w.safetensors"))
+    out = Place.of(str(root / "labels"))
+    results = Results(out, request)
+    worker = LabelScans(request, out.address)
+    for scans in list_scans([f"{fleet}/scans"], out):
+        drive = MeasureSensors(request)(scans)
+        results.add_drives(drive)
+        estimates = pa.repeat(drive["estimates"][0], len(scans))
+        rows = worker(scans.append_column("estimates", estimates))
+        results.add(rows.drop_columns([IS_FATAL.name]))
     results.flush()
 
     paths = [str(path) for path in sorted((fleet / "scans").rglob("*.bin"))]
@@ -70,8 +70,8 @@ def test_the_worker_labels_the_partitions_of_other_engines(
 ) -> None:
     monkeypatch.chdir(world)
     _, functions = re.findall(r"```python\n(.*?)```", PAGE, re.S)
-    labelling = Labelling(load(fleet / "w.safetensors"), str(tmp_path))
-    names: dict[str, Any] = {"labelling": labelling, "LabelScans": LabelScans, "pa": pa}
+    request = LabellingRequest(load(fleet / "w.safetensors"))
+    names: dict[str, Any] = {"request": request, "LabelScans": LabelScans, "pa": pa}
     exec(functions, names)
 
     frame = pd.read_parquet("fleet.parquet").iloc[:4]
@@ -82,13 +82,6 @@ def test_the_worker_labels_the_partitions_of_other_engines(
     dask = pytest.importorskip("dask.dataframe")
     shares = names["on_dask"](dask.from_pandas(frame, npartitions=1)).compute()
     assert shares["uncertain"].tolist() == rows["uncertain"].tolist()
-
-
-def test_the_names_that_the_page_imports_exist() -> None:
-    (pipeline, _) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
-    assert "Labelling(amvnet.weights.load(" in pipeline
-    weights = amvnet.weights.load("sim-hdl64e")
-    assert replace(Labelling(weights, out="labels"), kind="npy").taxonomy is weights.taxonomy
 
 
 def test_the_page_names_every_column_of_the_tables(world: Path) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 from rich import progress as rich_progress
 from rich.console import Console, RenderableType
 
+from amvnet.errors import without_secrets
 from amvnet.progress import Progress, Tenths
 
 LONGEST_LINE = 5000  # characters
@@ -105,7 +106,8 @@ def complain(line: str) -> None:
 
 
 def printable(text: str) -> str:
-    """Return a text on one line: shortened, and with escapes for what is not printable."""
+    """Return a text on one line: shortened, without secrets, not printable characters escaped."""
+    text = without_secrets(text)
     if len(text) > LONGEST_LINE:
         text = f"{text[:LONGEST_LINE]}... ({len(text):,} characters)"
     if text.isprintable():

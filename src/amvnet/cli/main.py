@@ -16,6 +16,7 @@ from amvnet.cli.commands.check import check
 from amvnet.cli.commands.demo import demo
 from amvnet.cli.commands.evaluate import evaluate
 from amvnet.cli.commands.export import export
+from amvnet.cli.commands.fleet import fleet
 from amvnet.cli.commands.fuse import fuse
 from amvnet.cli.commands.info import info
 from amvnet.cli.commands.predict import predict
@@ -31,10 +32,10 @@ from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
 # In the order of the help.
-_FIRST = (demo, simulate, check, train, predict, evaluate, submit, fuse)
+_FIRST = (demo, simulate, check, train, predict, fleet, evaluate, submit, fuse)
 _LAST = (rank, analyze, ablate, export, view, bench, info)
 VERBS = {run_verb.__name__: run_verb for run_verb in _FIRST + _LAST}
-RESUMED = ("train", "predict")  # verbs with --resume
+RESUMED = ("train", "predict", "fleet")  # verbs with --resume
 GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done
 SHARED = ("train", "evaluate", "ablate")  # verbs whose work several processes can share
 WITH_RECIPE = ("train", "ablate")  # verbs whose options are also the values of a recipe

@@ -236,8 +236,6 @@ def _add_option(target: Any, name: str, kind: Any, default: Any, text: str) -> N
         options["action"] = "store_true"
     elif get_origin(kind) is list:  # may be given several times
         options |= {"action": "append", "metavar": name.upper()}
-    elif kind == str | bool:  # its value may be left out
-        options |= {"nargs": "?", "const": True, "metavar": "ADDRESS"}
     else:
         options["metavar"] = metavar_of(name, kind)
     target.add_argument(flag_of(name), **options)

@@ -1,8 +1,10 @@
-"""List the scans of a fleet in blocks, with few names in memory at a time."""
+"""List the scans of a fleet in tables, with few names in memory at a time."""
 
 from __future__ import annotations
 
+import posixpath
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,17 @@ import pyarrow.csv
 import pyarrow.parquet
 from pyarrow.fs import FileType
 
+from amvnet.data.datasets.open import is_dataset
 from amvnet.data.formats.detect import BAGS, named_ending
 from amvnet.data.formats.find import is_scan_name
-from amvnet.errors import InputError
-from amvnet.fleet.storage import Place, reaching
+from amvnet.errors import InputError, reason_of, without_secrets
+from amvnet.fleet.storage import Place
 
-BLOCK = 64  # scans
 MANIFESTS = (".parquet", ".csv")
 COLUMNS = ("path", "name", "drive")  # of a manifest; only the first is needed
-CSV_BYTES = 16 << 20  # of a manifest, read at a time
+SCANS = pa.schema([(name, pa.string()) for name in COLUMNS])
+CSV_BYTES = 16 << 20  # read at a time
+LISTED = 65_536  # scans of a folder in a table
 
 
 class NameSet:
@@ -60,87 +64,98 @@ def _digests(names: Sequence[str]) -> np.ndarray:
     return np.frombuffer(b"".join(each.digest() for each in content), np.uint64)
 
 
-def list_blocks(inputs: Iterable[str]) -> Iterator[pa.Table]:
-    """Yield the scans of the inputs in blocks, each of scans of one drive.
+def list_scans(inputs: Iterable[str], out: Place) -> Iterator[pa.Table]:
+    """Yield the scans of the inputs in tables with the columns of a manifest.
 
-    A block is a table with the columns of a manifest: `path` is a URL, `name` that of the label
-    file, without an ending, relative to the output folder.
+    `path` is a URL; `name` is the path of the label file, without an ending, relative to the output
+    folder: equal names are equal paths.
 
-    A drive is a folder, or of a manifest what its column `drive` says. The scans of a folder have
+    A drive is a folder, or what the column `drive` of a manifest says. The scans of a folder have
     the order of their names.
 
     Args:
         inputs: each the URL or the path of a folder of scan files and folders, of a scan file, or
             of a manifest: a Parquet or CSV file with a row for each scan.
+        out: the output folder.
 
     Raises:
-        InputError: if an input cannot be reached, has no scan, or has recordings of several scans
-            in a file.
+        InputError: if an input cannot be reached, is a dataset, has no scan, has recordings of
+            several scans in a file, or if the output folder lies in it, or the other way round.
     """
     for text in inputs:
+        if is_dataset(text):
+            raise InputError(
+                f"{text}: expected scan files or a manifest, found a dataset; segment it with "
+                "amvnet predict"
+            )
         place = Place.of(text)
-        kind = place.kind()
-        if kind == FileType.Directory:
-            blocks = _walk(place, "")
-        elif kind == FileType.File and place.path.lower().endswith(MANIFESTS):
-            blocks = _read_manifest(place)
-        elif kind == FileType.File:
-            folder, _, file = place.url.rpartition("/")
-            blocks = _in_blocks(folder, "", [file])
-        else:
-            raise InputError(
-                f"{text}: expected scan files, a folder of them or a manifest, found nothing; "
-                "check the URL"
-            )
-
         is_empty = True
-        for block in blocks:
+        for table in _list_input(place, out):
+            _check_outside(table["path"].to_pylist(), out)
             is_empty = False
-            yield block
+            yield table
         if is_empty:
-            raise InputError(f"{text}: expected scan files, found none; give the folder of scans")
-
-
-def _walk(folder: Place, prefix: str) -> Iterator[pa.Table]:
-    """Yield the scans of a folder, and then those of its folders.
-
-    Args:
-        prefix: the beginning of the names of the scans.
-    """
-    names, folders = folder.children()
-    present = set(names)
-    files = []
-    for name in names:
-        is_scores = name.endswith(".npz") and name.replace(".npz", ".label") in present
-        if is_scan_name(name) and not is_scores:
-            files.append(name)
-    yield from _in_blocks(folder.url, prefix, files)
-    for name in folders:
-        if not name.startswith("."):
-            yield from _walk(folder / name, f"{prefix}{name}/")
-
-
-def _in_blocks(folder: str, prefix: str, files: Iterable[str]) -> Iterator[pa.Table]:
-    """Yield the scans of one folder; files of different formats are different drives."""
-    drives: dict[str, list[tuple[str, str]]] = {}  # by ending
-    for file in files:
-        stem, ending = split_name(file)
-        drives.setdefault(ending, []).append((f"{folder}/{file}", f"{prefix}{stem}"))
-
-    for ending, scans in drives.items():
-        if ending in BAGS:
             raise InputError(
-                f"{scans[0][0]}: expected files of one scan for --ray, found a "
-                "recording; segment it without --ray"
+                f"{place.url}: expected scan files, found none; give the folder of scans"
             )
-        yield from _cut(scans, f"{folder}/*{ending}")
 
 
-def _cut(scans: Sequence[tuple[str, str]], drive: str) -> Iterator[pa.Table]:
-    """Yield the scans of a drive, each a URL and a name, in blocks."""
-    for start in range(0, len(scans), BLOCK):
-        urls, names = zip(*scans[start : start + BLOCK], strict=True)
-        yield pa.table([urls, names, len(urls) * [drive]], names=COLUMNS)
+def _list_input(place: Place, out: Place) -> Iterator[pa.Table]:
+    """Yield the scans of an input."""
+    kind = place.kind()
+    if kind == FileType.NotFound:
+        raise InputError(
+            f"{place.url}: expected scan files, a folder of them or a manifest, found nothing; "
+            "check the URL"
+        )
+    if kind == FileType.File and place.path.lower().endswith(MANIFESTS):
+        yield from _read_manifest(place)
+    elif kind == FileType.File:
+        folder, _, file = place.address.rpartition("/")
+        yield from _scans_in(folder, "", [file])
+    elif out.is_in(place):
+        raise InputError(
+            f"{out.url}: expected a folder outside the inputs, found one in {place.url}; "
+            "change --out"
+        )
+    else:
+        for prefix, folder_place, names in place.walk():
+            present = set(names)
+            files = []
+            for name in names:
+                is_scores = name.endswith(".npz") and name.replace(".npz", ".label") in present
+                if is_scan_name(name) and not is_scores:
+                    files.append(name)
+            yield from _scans_in(folder_place.address, prefix, files)
+
+
+def _check_outside(urls: Sequence[str], out: Place) -> None:
+    """Raise InputError if a scan lies in the output folder, where labels could replace it."""
+    for url in urls:
+        place = Place.of(url)
+        if place.is_in(out):
+            raise InputError(
+                f"{place.url}: expected scans outside the output folder, found one in {out.url}; "
+                "change --out"
+            )
+
+
+def _scans_in(folder: str, prefix: str, files: Sequence[str]) -> Iterator[pa.Table]:
+    """Yield the scans of one folder; files of different formats are different drives."""
+    for start in range(0, len(files), LISTED):
+        rows = []
+        for file in files[start : start + LISTED]:
+            stem, ending = split_name(file)
+            if ending in BAGS:
+                raise InputError(
+                    f"{without_secrets(folder)}/{file}: expected files of one scan, found a "
+                    "recording of several; segment it with amvnet predict"
+                )
+            drive = f"{without_secrets(folder)}/*{ending}"
+            rows.append(
+                {"path": f"{folder}/{file}", "name": _as_path(prefix + stem), "drive": drive}
+            )
+        yield pa.Table.from_pylist(rows, SCANS)
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -149,55 +164,87 @@ def split_name(name: str) -> tuple[str, str]:
     return name[: len(name) - len(ending)], ending
 
 
+def _as_path(name: str) -> str:
+    """Return the one spelling of all names of one file: x/a for x//a and ./x/a."""
+    return posixpath.normpath(name)
+
+
 def _read_manifest(place: Place) -> Iterator[pa.Table]:
-    """Yield the scans of a manifest; rows of one drive need not follow one another."""
-    folder = place.url.rpartition("/")[0]
-    for rows in _read_batches(place):
-        drives: dict[str, list[tuple[str, str]]] = {}
-        for row in rows:
-            url, name, drive = _resolve(row, folder)
-            drives.setdefault(drive, []).append((url, name))
-        for drive, scans in drives.items():
-            yield from _cut(scans, drive)
+    """Yield the scans of a manifest."""
+    folder = place.address.rpartition("/")[0]
+    for rows in _read_rows(place):
+        yield pa.Table.from_pylist([_resolve(row, folder) for row in rows], SCANS)
 
 
-def _resolve(row: dict[str, Any], folder: str) -> tuple[str, str, str]:
+def _resolve(row: dict[str, Any], folder: str) -> dict[str, str]:
     """Return the URL, the name and the drive of a row.
 
     A path is relative to the folder of the manifest. The name is the path without its ending; if
     the path is a URL, only what follows the bucket.
     """
-    path = row["path"] or ""
-    _, is_url, rest = path.partition("://")
+    path = row["path"]
+    _, is_url, _ = path.partition("://")
     is_absolute = bool(is_url) or path.startswith("/")
     url = path if is_absolute else f"{folder}/{path}"
-    relative = rest.partition("/")[2] if is_url else path.lstrip("/")
+    shown_url = without_secrets(url)
+    relative = path.lstrip("/")
+    if is_url:
+        relative = without_secrets(path).partition("://")[2].partition("/")[2].lstrip("/")
 
     parent, slash, file = relative.rpartition("/")
     stem, ending = split_name(file)
-    name = row.get("name") or f"{parent}{slash}{stem}"
-    drive = row.get("drive") or f"{url.rpartition('/')[0]}/*{ending}"
-    return url, name, drive
+    name = _as_path(row.get("name") or f"{parent}{slash}{stem}")
+    drive = row.get("drive") or f"{shown_url.rpartition('/')[0]}/*{ending}"
+    return {"path": url, "name": name, "drive": without_secrets(drive)}
 
 
-def _read_batches(place: Place) -> Iterator[list[dict[str, Any]]]:
-    """Yield the rows of a manifest; raise InputError if it is unusable."""
-    with reaching(place.url), place.filesystem.open_input_file(place.path) as file:
+def _read_rows(place: Place) -> Iterator[list[dict[str, Any]]]:
+    """Yield the rows of a manifest; raise InputError if it cannot be used."""
+    with _reading(place), place.filesystem.open_input_file(place.path) as file:
         if place.path.lower().endswith(".csv"):
             in_parts = pa.csv.ReadOptions(block_size=CSV_BYTES)
             as_texts = pa.csv.ConvertOptions(column_types=dict.fromkeys(COLUMNS, pa.string()))
             batches = pa.csv.open_csv(file, in_parts, convert_options=as_texts)
-            names = batches.schema.names
+            names = _check_columns(place, batches.schema.names)
         else:
             table = pa.parquet.ParquetFile(file)
-            names = table.schema_arrow.names
-            batches = table.iter_batches(columns=[name for name in COLUMNS if name in names])
-        if "path" not in names:
-            raise InputError(
-                f"{place.url}: expected a manifest with a column path, found "
-                f"{', '.join(names)[:200]}; name the column of the scans' files path"
-            )
+            names = _check_columns(place, table.schema_arrow.names)
+            batches = table.iter_batches(columns=names)
 
-        texts = pa.schema([(name, pa.string()) for name in COLUMNS if name in names])
         for batch in batches:
-            yield pa.Table.from_batches([batch]).select(texts.names).cast(texts).to_pylist()
+            texts = pa.schema([(name, pa.string()) for name in names])
+            rows = pa.Table.from_batches([batch]).select(names).cast(texts)
+            if not all(rows["path"].to_pylist()):
+                raise InputError(
+                    f"{place.url}: expected a path in each row, found a row without; correct it"
+                )
+            yield rows.to_pylist()
+
+
+def _check_columns(place: Place, names: Sequence[str]) -> list[str]:
+    """Return the columns that are read; raise InputError if one is missing or there twice."""
+    present = [name for name in names if name in COLUMNS]
+    if "path" not in present:
+        raise InputError(
+            f"{place.url}: expected a manifest with a column path, found "
+            f"{', '.join(names)[:200]}; name the column of the scans' files path"
+        )
+    for name in present:
+        if present.count(name) > 1:
+            raise InputError(
+                f"{place.url}: expected one column {name}, found {present.count(name)}; "
+                "leave one out"
+            )
+    return present
+
+
+@contextmanager
+def _reading(place: Place) -> Iterator[None]:
+    """Turn errors of a manifest that cannot be read into an `InputError` of one line."""
+    try:
+        yield
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(
+            f"{place.url}: expected a manifest, a Parquet or CSV file with a column path, found "
+            f"{without_secrets(reason_of(error))}; write it again"
+        ) from None

@@ -1,11 +1,12 @@
-"""The tables of a fleet: results, in parts that are also its journal, and drives."""
+"""The tables of a fleet: results, in parts that also say what is done, and drives."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from io import BytesIO
 from typing import Any
@@ -16,10 +17,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet
 from pyarrow.fs import FileType
 
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import PARTS
 from amvnet.fleet.manifest import NameSet
 from amvnet.fleet.storage import Place, reaching
 from amvnet.inference.journal import check_settings
+from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.frame import Frame
 from amvnet.sensors.lasers import SensorGeometry
 from amvnet.sensors.measure import Estimate
@@ -27,8 +31,9 @@ from amvnet.sensors.measure import Estimate
 FOLDER = "results"  # in the output folder
 SETTINGS = "run.json"
 DRIVES = "drives.parquet"
+PART = re.compile(r"part-(\d{6})\.parquet")
 PART_BYTES = 64 << 20
-PART_SECONDS = 60.0  # between two parts; what a killed driver loses
+PART_SECONDS = 60.0  # between two parts; a killed driver loses the rows of this time
 
 DRIVES_SCHEMA = pa.schema(
     {
@@ -42,78 +47,137 @@ DRIVES_SCHEMA = pa.schema(
 )
 
 
+def results_schema(taxonomy: Taxonomy) -> pa.Schema:
+    """Return the columns of the table of results for some classes."""
+    counts = pa.struct([(name, pa.int32()) for name in taxonomy.classes])
+    means = pa.struct([(name, pa.float32()) for name in taxonomy.classes])
+    return pa.schema(
+        {
+            "scan": pa.string(),
+            "drive": pa.string(),
+            "path": pa.string(),
+            "labels": pa.string(),  # URL of the label file
+            "points": pa.int32(),  # valid ones
+            "uncertain": pa.float32(),  # share of the points
+            "class_points": counts,
+            "class_uncertain": counts,
+            "class_confidence": means,  # of the largest score of each point
+            "seconds": pa.float32(),  # of the worker
+            "worker": pa.string(),
+            "weights": pa.string(),  # digest
+            "error": pa.string(),
+        }
+    )
+
+
 class Results:
-    """The table of results in an output folder, `results/part-000000.parquet` and so on.
+    """The tables in an output folder: `results/part-000000.parquet` and so on, and the drives.
 
     A part is written when it is large enough, or after some time. A scan is done if a part has it
-    without an error. Rows with an error are removed when a run is resumed, so that each scan has
-    one row.
+    without an error, and its label file exists. The rows of other scans are removed when a run is
+    resumed, so that each scan has one row.
 
     Args:
-        settings: what the results depend on, as JSON types.
+        out: the output folder.
+        request: how the scans are labelled.
         resume: whether to go on with an earlier run.
-        overwrite: whether the folder may hold other files.
 
     Attributes:
         done: the names of the scans that an earlier run has done.
-        drives: the row of each drive, from `describe_drive`.
+        estimates: for each drive that is measured, its `estimates` from `describe_drive`.
 
     Raises:
-        InputError: if the folder cannot be written, holds something else, or the earlier run had
-            other settings.
+        InputError: if the folder cannot be written or holds something else, or the earlier run had
+            another request.
     """
 
-    def __init__(
-        self, out: Place, settings: Mapping[str, Any], resume: bool = False, overwrite: bool = False
-    ) -> None:
+    def __init__(self, out: Place, request: LabellingRequest, resume: bool = False) -> None:
+        self.out = out
         self.folder = out / FOLDER
         self.done = NameSet()
+        self.estimates: dict[str, str] = {}
+        self._schema = results_schema(request.taxonomy)
+        self._endings = request.endings
         self._pending: list[pa.Table] = []
         self._last = time.monotonic()  # when the last part was written
         self._number = 0  # of the next part
 
-        self.drives: dict[str, dict[str, Any]] = {}
         place = self.folder / SETTINGS
-        if place.kind() == FileType.File:
-            if not resume:
-                raise InputError(
-                    f"{out.url}: expected a new folder, found the results of an earlier run; say "
-                    "--resume to go on with it, or change --out"
-                )
-            _check_same(place, settings)
-            self._read_parts()
-            self._read_drives()
-        else:
-            if not overwrite:
-                _check_empty(out)
-            _write_settings(place, settings)
+        if place.kind() != FileType.File:
+            _check_empty(out)
+            _write_settings(place, request.settings)
+            return
+        if not resume:
+            raise InputError(
+                f"{out.url}: expected a new folder, found the results of an earlier run; say "
+                "--resume to go on with it, or change --out"
+            )
+        _check_same(place, request.settings)
+        self._remove_unfinished()
+        self._keep_done()
+        self._take_estimates(self._read_drives())
 
-    def _read_parts(self) -> None:
-        """Read which scans are done, and remove the rows of the others."""
-        files, _ = self.folder.children()
-        for file in files:
-            if not file.startswith("part-"):
-                continue
-            place = self.folder / file
-            table = _read(place)
+    def read(self) -> Iterator[tuple[Place, pa.Table, np.ndarray]]:
+        """Yield each part with its table, and which of its rows, (N,) bool, are done.
+
+        Raises:
+            InputError: if a file of the folder is not one of a fleet.
+        """
+        present = NameSet()
+        label_ending = self._endings[0]
+        for prefix, _, files in self.out.walk():
+            present.add([f"{prefix}{file}" for file in files if file.endswith(label_ending)])
+
+        for name in self._part_names():
+            table = _read(self.folder / name, self._schema)
             is_done = pc.is_null(table["error"]).to_numpy()
-            is_done[is_done] = self.done.add(table["scan"].filter(is_done).to_pylist())
+            labels = [f"{scan}{label_ending}" for scan in table["scan"].to_pylist()]
+            yield self.folder / name, table, is_done & present.has(labels)
+
+    def _part_names(self) -> list[str]:
+        """Return the names of the parts; raise InputError if there are files of something else."""
+        files, _ = self.folder.children()
+        names = []
+        for file in files:
+            match = PART.fullmatch(file)
+            if match is not None:
+                names.append(file)
+                self._number = max(self._number, int(match[1]) + 1)
+            elif file not in (SETTINGS, DRIVES) and not file.startswith("."):
+                raise InputError(
+                    f"{self.folder.url}/{file}: expected only tables of a fleet in this folder, "
+                    "found another file; move it away"
+                )
+        return names
+
+    def _remove_unfinished(self) -> None:
+        """Remove the files on this machine that killed processes have not finished."""
+        if self.out.local is not None:
+            for path in self.out.local.rglob(PARTS):
+                path.unlink(missing_ok=True)
+
+    def _keep_done(self) -> None:
+        """Collect which scans are done, and remove the rows of the others."""
+        for place, table, is_done in self.read():
+            names = table["scan"].filter(is_done).to_pylist()
+            is_done[is_done] = self.done.add(names)
             if not is_done.all():
                 _replace(place, table.filter(is_done))
-            self._number = int(file[len("part-") : -len(".parquet")]) + 1
 
-    def _read_drives(self) -> None:
+    def _read_drives(self) -> pa.Table:
         place = self.folder / DRIVES
-        if place.kind() == FileType.File:
-            self.drives = {row["drive"]: row for row in _read(place).to_pylist()}
+        if place.kind() != FileType.File:
+            return DRIVES_SCHEMA.empty_table()
+        return _read(place, DRIVES_SCHEMA)
 
-    def add_drives(self, rows: Sequence[dict[str, Any]]) -> None:
-        """Add rows of drives, and write the table of all."""
-        if not rows:
-            return
-        self.drives |= {row["drive"]: row for row in rows}
-        table = pa.Table.from_pylist(list(self.drives.values()), DRIVES_SCHEMA)
-        _replace(self.folder / DRIVES, table)
+    def add_drives(self, drives: pa.Table) -> None:
+        """Add rows of drives to their table."""
+        _replace(self.folder / DRIVES, pa.concat_tables([self._read_drives(), drives]))
+        self._take_estimates(drives)
+
+    def _take_estimates(self, drives: pa.Table) -> None:
+        for row in drives.select(["drive", "estimates"]).to_pylist():
+            self.estimates[row["drive"]] = row["estimates"]
 
     def add(self, rows: pa.Table) -> None:
         """Add rows, and write a part if it is time."""
@@ -133,10 +197,30 @@ class Results:
         self._last = time.monotonic()
 
 
-def _read(place: Place) -> pa.Table:
-    """Return a table; raise InputError if it cannot be read."""
+def _read(place: Place, schema: pa.Schema) -> pa.Table:
+    """Return a table with the columns of a schema, the first without nulls.
+
+    Raises:
+        InputError: if it cannot be read, or has other columns.
+    """
     with reaching(place.url):
-        return pa.parquet.read_table(BytesIO(place.read()))
+        table = pa.parquet.read_table(BytesIO(place.read()))
+    found = ""
+    if table.column_names != schema.names:
+        found = f"the columns {', '.join(table.column_names)[:200]}"
+    else:
+        with suppress(pa.ArrowException):
+            table = table.cast(schema)
+        if table.schema != schema:
+            found = "columns of other types"
+        elif table.column(0).null_count:
+            found = f"a row without {schema.names[0]}"
+    if found:
+        raise InputError(
+            f"{place.url}: expected a table that amvnet fleet has written, found {found}; change "
+            "--out, or move the file away"
+        )
+    return table
 
 
 def _replace(place: Place, table: pa.Table) -> None:
@@ -156,16 +240,16 @@ def _check_empty(out: Place) -> None:
     files, folders = out.children()
     if files or folders:
         raise InputError(
-            f"{out.url}: expected a new folder, found {(files + folders)[0]} in it; change --out, "
-            "or say --overwrite to keep it and write, too"
+            f"{out.url}: expected a new folder, found {(files + folders)[0]} in it; change --out"
         )
 
 
 def _check_same(place: Place, settings: Mapping[str, Any]) -> None:
     """Raise InputError if the file of an earlier run holds other settings."""
+    content = place.read()
     earlier = None
-    with suppress(UnicodeDecodeError, json.JSONDecodeError, RecursionError):
-        earlier = json.loads(place.read())
+    with suppress(ValueError, RecursionError):  # no text, no JSON, a number of too many digits
+        earlier = json.loads(content)
     known = earlier if isinstance(earlier, dict) else {}
     check_settings(place.url, settings, earlier=known, advice="change --out")
 
@@ -187,8 +271,7 @@ def describe_drive(drive: str, assumed: str, usual: Estimate | None) -> dict[str
 
     Args:
         assumed: a line about the first scan.
-        usual: measured of the first scans; None if these could not be read, or are of several
-            sensors.
+        usual: the median of the first scans; None if they cannot be read or have several sensors.
     """
     frame = Frame() if usual is None else usual.frame
     values = None if usual is None else dataclasses.asdict(usual)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import fs
 
-from amvnet.errors import InputError, reason_of
+from amvnet.errors import CREDENTIALS, InputError, reason_of, without_secrets
 from amvnet.files import atomic_write
 
 # Without it, pyarrow uploads even a small file in three requests.
@@ -24,12 +25,12 @@ class Place:
     """A file or a folder on this machine or in object storage; it need not exist.
 
     Attributes:
-        url: as a user would write it.
-        filesystem: that of pyarrow which has it.
-        path: in the filesystem.
+        address: the URL as the user wrote it, which may hold credentials; or an absolute path.
+        filesystem: pyarrow's filesystem that holds the place.
+        path: the path in the filesystem.
     """
 
-    url: str
+    address: str
     filesystem: fs.FileSystem
     path: str
 
@@ -46,16 +47,35 @@ class Place:
             return cls(path, fs.LocalFileSystem(), path)
 
         bucket, slash, path = rest.rstrip("/").partition("/")
+        if "@" not in bucket and CREDENTIALS.search(url):
+            raise InputError(
+                f"{without_secrets(url)}: expected a password with / written as %2F, found one "
+                "with /; escape it"
+            )
         filesystem, root = _open(scheme, bucket)
         return cls(url.rstrip("/"), filesystem, f"{root.rstrip('/')}{slash}{path}")
 
     def __truediv__(self, name: str) -> Place:
-        return Place(f"{self.url}/{name}", self.filesystem, f"{self.path}/{name}")
+        return Place(f"{self.address}/{name}", self.filesystem, f"{self.path}/{name}")
+
+    @property
+    def url(self) -> str:
+        """The address to show and to store: without credentials."""
+        return without_secrets(self.address)
 
     @property
     def local(self) -> Path | None:
         """The path, if it is on this machine."""
         return Path(self.path) if isinstance(self.filesystem, fs.LocalFileSystem) else None
+
+    def is_in(self, folder: Place) -> bool:
+        """Return whether the place is a folder or lies in it, after links are followed."""
+        if self.filesystem.type_name != folder.filesystem.type_name:
+            return False
+        paths = [place.path for place in (self, folder)]
+        if isinstance(self.filesystem, fs.LocalFileSystem):
+            paths = [os.path.realpath(path) for path in paths]
+        return f"{paths[0]}/".startswith(f"{paths[1].rstrip('/')}/")
 
     def kind(self) -> fs.FileType:
         """Return whether it is a file, a folder or nothing.
@@ -67,7 +87,7 @@ class Place:
             return self.filesystem.get_file_info(self.path).type
 
     def children(self) -> tuple[list[str], list[str]]:
-        """Return the sorted names of the files in a folder, and those of its folders.
+        """Return the sorted names of the files in a folder, and of the folders in it.
 
         Raises:
             InputError: if the folder cannot be listed.
@@ -79,6 +99,21 @@ class Place:
                 names = folders if info.type == fs.FileType.Directory else files
                 names.append(info.base_name)
         return sorted(files), sorted(folders)
+
+    def walk(self, prefix: str = "") -> Iterator[tuple[str, Place, list[str]]]:
+        """Yield the folder and all folders in it that are not hidden, with their files.
+
+        Each comes with the beginning of the names of its files relative to this folder, such as
+        "drive/", and with their sorted names.
+
+        Raises:
+            InputError: if a folder cannot be listed.
+        """
+        files, folders = self.children()
+        yield prefix, self, files
+        for name in folders:
+            if not name.startswith("."):
+                yield from (self / name).walk(f"{prefix}{name}/")
 
     def fetch(self, folder: Path) -> Path:
         """Return the path of a file on this machine; if it is elsewhere, of a copy in a folder.
@@ -139,17 +174,18 @@ def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
     pyarrow has some storages itself; fsspec has the others.
     """
     root = f"{scheme}://{bucket}"
-    with reaching(root), suppress(pa.ArrowInvalid):  # not a scheme of pyarrow
+    shown_root = without_secrets(root)
+    with reaching(shown_root), suppress(pa.ArrowInvalid):  # not a scheme of pyarrow
         return fs.FileSystem.from_uri(f"{root}{OPTIONS.get(scheme, '/')}")
     try:
         return fs.FileSystem.from_uri(f"fsspec+{root}")
     except (ImportError, ValueError) as error:
         raise InputError(
-            f"{root}: expected a storage that can be opened, found {_reason_of(error)}; "
+            f"{shown_root}: expected a storage that can be opened, found {_reason_of(error)}; "
             "install its package, or use s3://, gs:// or file://"
         ) from None
 
 
 def _reason_of(error: BaseException) -> str:
     """Return `reason_of` an error, without the number that each request has."""
-    return reason_of(error).partition(" (Request ID")[0]
+    return without_secrets(reason_of(error)).partition(" (Request ID")[0]

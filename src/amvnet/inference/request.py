@@ -12,7 +12,7 @@ from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.inference.pipeline import OutputOptions
+from amvnet.inference.pipeline import UNCERTAIN_ENDING, OutputOptions
 from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import (
     EngineName,
@@ -78,6 +78,16 @@ class LabellingRequest(Checked):
     def taxonomy(self) -> Taxonomy:
         """The classes that are written."""
         return self.weights.taxonomy if self.classes is None else self.classes.target
+
+    @property
+    def endings(self) -> tuple[str, ...]:
+        """The endings of the files that are written for each scan file, the labels first."""
+        endings = [f".{self.kind}"]
+        if self.scores:
+            endings.append(".npz")
+        if self.uncertain:
+            endings.append(UNCERTAIN_ENDING)
+        return tuple(endings)
 
     @cached_property
     def settings(self) -> dict[str, Any]:

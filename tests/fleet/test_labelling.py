@@ -11,34 +11,47 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 
+from amvnet.data.formats.registry import read_file
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.fleet.actors import Labelling, LabelScans, results_schema, statistics
-from amvnet.fleet.manifest import list_blocks
+from amvnet.fleet.labelling import IS_FATAL, LabelScans, MeasureSensors, statistics
+from amvnet.fleet.manifest import list_scans
+from amvnet.fleet.results import results_schema
 from amvnet.fleet.storage import Place
+from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation
 from amvnet.weights.file import load
 
 from fixtures.s3_server import Bucket
 from fixtures.worlds import fails, succeed
 
+NOWHERE = Place.of("/an/output/folder/elsewhere")
+
 
 @pytest.fixture(scope="module")
-def labelling(fleet: Path) -> Labelling:
-    return Labelling(load(fleet / "w.safetensors"), "nowhere")
+def labelling(fleet: Path) -> LabellingRequest:
+    return LabellingRequest(load(fleet / "w.safetensors"))
 
 
-def label(labelling: Labelling, inputs: Sequence[str]) -> list[dict[str, Any]]:
+def label(request: LabellingRequest, out: str, inputs: Sequence[str]) -> list[dict[str, Any]]:
     """Label scans as the workers of a cluster do; return the rows of results."""
-    worker = LabelScans(labelling)
+    worker = LabelScans(request, out)
     rows = []
-    for block in list_blocks(inputs):
-        drive = worker.measure(block.slice(0, 5))
-        result = worker(with_estimates(block, drive["estimates"]))
-        assert result.schema == results_schema(labelling.taxonomy)
-        rows += result.to_pylist()
+    for scans in list_scans(inputs, NOWHERE):
+        for drive in scans["drive"].unique():
+            block = scans.filter(pc.equal(scans["drive"], drive))
+            result = worker(with_estimates(block, estimates_of(request, block)))
+            assert result.schema == results_schema(request.taxonomy).append(IS_FATAL)
+            rows += result.to_pylist()
     return rows
+
+
+def estimates_of(request: LabellingRequest, block: pa.Table) -> str:
+    (drive,) = MeasureSensors(request)(block.slice(0, 5)).to_pylist()
+    estimates: str = drive["estimates"]
+    return estimates
 
 
 def with_estimates(block: pa.Table, estimates: str) -> pa.Table:
@@ -46,9 +59,9 @@ def with_estimates(block: pa.Table, estimates: str) -> pa.Table:
 
 
 def test_labels_in_a_bucket_are_those_of_predict(
-    labelling: Labelling, labels: dict[str, bytes], bucket: Bucket
+    labelling: LabellingRequest, labels: dict[str, bytes], bucket: Bucket
 ) -> None:
-    rows = label(replace(labelling, out="s3://fleet/labels"), ["s3://fleet/scans"])
+    rows = label(labelling, "s3://fleet/labels", ["s3://fleet/scans"])
     assert set(bucket.keys("labels")) == set(labels)
     for name, content in labels.items():
         assert bucket[f"labels/{name}"] == content
@@ -58,10 +71,10 @@ def test_labels_in_a_bucket_are_those_of_predict(
 
 
 def test_labels_in_a_folder_are_those_of_predict_in_each_format(
-    labelling: Labelling, fleet: Path, tmp_path: Path
+    labelling: LabellingRequest, fleet: Path, tmp_path: Path
 ) -> None:
-    options = {"kind": "ply", "scores": True, "uncertain": True}
-    label(replace(labelling, out=str(tmp_path / "out"), **options), [f"{fleet}/scans"])  # type: ignore[arg-type]
+    options: dict[str, Any] = {"kind": "ply", "scores": True, "uncertain": True}
+    label(replace(labelling, **options), str(tmp_path / "out"), [f"{fleet}/scans"])
     succeed(
         f"predict '{fleet}/scans/*/*.bin' --weights {fleet}/w.safetensors --out {tmp_path}/whole "
         "--format ply --scores --uncertain"
@@ -74,12 +87,12 @@ def test_labels_in_a_folder_are_those_of_predict_in_each_format(
 
 
 def test_workers_normalise_by_what_was_measured_and_not_by_their_own_scans(
-    labelling: Labelling, fleet: Path, tmp_path: Path
+    labelling: LabellingRequest, fleet: Path, tmp_path: Path
 ) -> None:
     """A worker that gets only the last scans of a drive gives them the labels of the whole."""
-    (block,) = list(list_blocks([f"{fleet}/scans/drive4"]))
-    worker = LabelScans(replace(labelling, out=str(tmp_path)))
-    drive = worker.measure(block)
+    (block,) = list(list_scans([f"{fleet}/scans/drive4"], NOWHERE))
+    worker = LabelScans(labelling, str(tmp_path))
+    (drive,) = MeasureSensors(labelling)(block).to_pylist()
     assert drive["height"] == pytest.approx(2.5, abs=0.05)
     other = json.dumps(json.loads(drive["estimates"]) | {"quantiles": None})
 
@@ -89,9 +102,9 @@ def test_workers_normalise_by_what_was_measured_and_not_by_their_own_scans(
         assert ((tmp_path / "000003.label").read_bytes() == expected) == is_same
 
 
-def test_only_paths_are_needed(labelling: Labelling, fleet: Path, tmp_path: Path) -> None:
+def test_only_paths_are_needed(labelling: LabellingRequest, fleet: Path, tmp_path: Path) -> None:
     """In a user's own pipeline, the sensor is measured on the batch."""
-    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+    worker = LabelScans(labelling, str(tmp_path))
     paths = sorted((fleet / "scans/drive1").glob("*.bin"))
     worker(pa.table({"path": list(map(str, paths))}))
     for path in paths:
@@ -100,12 +113,12 @@ def test_only_paths_are_needed(labelling: Labelling, fleet: Path, tmp_path: Path
 
 
 def test_broken_scans_have_a_row_with_one_line_and_the_others_labels(
-    labelling: Labelling, labels: dict[str, bytes], fleet: Path, bucket: Bucket
+    labelling: LabellingRequest, labels: dict[str, bytes], fleet: Path, bucket: Bucket
 ) -> None:
     bucket.upload(fleet / "scans/drive0", "broken")
     bucket["broken/000001.bin"] = b"123"
     bucket["broken/000002.pcd"] = b"VERSION"
-    rows = label(replace(labelling, out="s3://fleet/broken-out"), ["s3://fleet/broken"])
+    rows = label(labelling, "s3://fleet/broken-out", ["s3://fleet/broken"])
     errors = {row["path"]: row["error"] for row in rows if row["error"]}
     assert set(errors) == {"s3://fleet/broken/000001.bin", "s3://fleet/broken/000002.pcd"}
     for path, error in errors.items():
@@ -115,32 +128,86 @@ def test_broken_scans_have_a_row_with_one_line_and_the_others_labels(
     assert bucket["broken-out/000003.label"] == labels["drive0/000003.label"]
 
 
-def test_a_scan_that_is_gone_is_a_broken_one(labelling: Labelling, tmp_path: Path) -> None:
-    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+def test_a_scan_that_is_gone_is_a_broken_one(labelling: LabellingRequest, tmp_path: Path) -> None:
+    worker = LabelScans(labelling, str(tmp_path))
     for path in (f"{tmp_path}/gone.bin", "s3://fleet/gone.bin"):
         (row,) = worker(pa.table({"path": [path]})).to_pylist()
         assert row["error"].startswith(f"{path}: expected")
 
 
-def test_a_fault_of_a_library_is_a_row_if_it_is_known_of_which_scan(
-    labelling: Labelling, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_fault_of_a_library_is_the_row_of_its_scan_and_the_others_are_labelled(
+    labelling: LabellingRequest, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    worker = LabelScans(replace(labelling, out=str(tmp_path)))
-    monkeypatch.setattr("amvnet.fleet.actors.read_file", lambda *_: 1 / 0)
-    paths = [f"{fleet}/scans/drive0/{index:06d}.bin" for index in range(2)]
-    with pytest.raises(ZeroDivisionError):
-        worker(pa.table({"path": paths}))
-    (row,) = worker(pa.table({"path": paths[:1]})).to_pylist()
-    assert row["error"] == f"{paths[0]}: expected a scan, found ZeroDivisionError: division by zero"
+    paths = [f"{fleet}/scans/drive1/{index:06d}.bin" for index in range(4)]
+
+    def read(path: Path, *others: Any) -> object:
+        return 1 / 0 if str(path) == paths[2] else read_file(path, *others)
+
+    (block,) = list(list_scans([f"{fleet}/scans/drive1"], NOWHERE))
+    estimates = estimates_of(labelling, block)
+    monkeypatch.setattr("amvnet.fleet.labelling.read_file", read)
+    rows = LabelScans(labelling, str(tmp_path))(with_estimates(block, estimates)).to_pylist()
+    errors = [row["error"] for row in rows]
+    fault = f"{paths[2]}: expected a scan, found ZeroDivisionError: division by zero"
+    assert errors == [None, None, fault, None]
+    for index in (0, 1, 3):
+        expected = fleet / f"labels/drive1/{index:06d}.label"
+        assert (tmp_path / f"{index:06d}.label").read_bytes() == expected.read_bytes()
+
+
+def test_what_is_no_scan_file_is_a_broken_scan_in_one_line(
+    labelling: LabellingRequest, tmp_path: Path
+) -> None:
+    """A folder, a bag, a name that leads out of the output folder, a storage that is not there."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "a.bin").write_bytes(np.ones((9, 4), np.float32).tobytes())
+    rows = [
+        {"path": f"{tmp_path}/folder", "name": "1", "drive": "a"},
+        {"path": f"{tmp_path}/folder/", "name": "2", "drive": "b"},
+        {"path": f"{tmp_path}/drive.bag", "name": "3", "drive": "c"},
+        {"path": f"{tmp_path}/a.bin", "name": "../a", "drive": "d"},
+        {"path": "nowhere://a.bin", "name": "4", "drive": "e"},
+    ]
+    worker = LabelScans(labelling, str(tmp_path / "out"))
+    errors = worker(pa.Table.from_pylist(rows))["error"].to_pylist()
+    for error, found in zip(
+        errors, ("a folder", "a folder", "a recording", "leads elsewhere", "nowhere"), strict=True
+    ):
+        assert "expected" in error
+        assert found in error, error
+        assert "\n" not in error
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.bin", "drive.bag", "folder"]
+
+
+def test_credentials_of_a_url_are_in_no_row(
+    labelling: LabellingRequest, bucket: Bucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The workers read and write with them."""
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    bucket["secret/broken.bin"] = b"123"
+    own = "s3://anybody:pass%2Fword@fleet"
+    (scans,) = list(list_scans([f"{own}/scans/drive0"], NOWHERE))
+    (broken,) = list(list_scans([f"{own}/secret"], NOWHERE))
+    worker = LabelScans(labelling, f"{own}/secret-out")
+    drives = MeasureSensors(labelling)(scans)
+    rows = worker(pa.concat_tables([scans, broken]))
+    assert rows["error"].null_count == len(scans)
+    for table in (drives, rows):
+        shown = str(table.to_pylist())
+        assert "s3://fleet/" in shown
+        assert "anybody" not in shown
+        assert "word" not in shown
 
 
 def test_a_full_disk_is_fatal(
-    labelling: Labelling, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    labelling: LabellingRequest, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "/full/000000.label")
 
-    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+    worker = LabelScans(labelling, str(tmp_path))
     monkeypatch.setattr("amvnet.inference.pipeline.Pipeline.write", fail)
     (row,) = worker(pa.table({"path": [f"{fleet}/scans/drive0/000000.bin"]})).to_pylist()
     assert row["is_fatal"]
@@ -148,21 +215,21 @@ def test_a_full_disk_is_fatal(
 
 
 def test_a_bucket_that_takes_no_labels_is_fatal(
-    labelling: Labelling, fleet: Path, monkeypatch: pytest.MonkeyPatch
+    labelling: LabellingRequest, fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")  # where nothing listens
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "anybody")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "anything")
-    worker = LabelScans(replace(labelling, out="s3://no-such-bucket/out"))
+    worker = LabelScans(labelling, "s3://no-such-bucket/out")
     (row,) = worker(pa.table({"path": [f"{fleet}/scans/drive0/000000.bin"]})).to_pylist()
     assert row["is_fatal"]
     assert row["error"].startswith("s3://no-such-bucket/out/000000.label: ")
 
 
 def test_the_row_of_a_scan_counts_its_labels(
-    labelling: Labelling, fleet: Path, tmp_path: Path
+    labelling: LabellingRequest, fleet: Path, tmp_path: Path
 ) -> None:
-    rows = label(replace(labelling, out=str(tmp_path)), [f"{fleet}/scans/drive0"])
+    rows = label(labelling, str(tmp_path), [f"{fleet}/scans/drive0"])
     for row in rows:
         raw = np.fromfile(row["labels"], np.uint32)
         ids = SEMANTICKITTI.to_train(raw)
@@ -185,13 +252,6 @@ def test_confidence_is_the_mean_largest_score_of_a_class() -> None:
     assert confidence == {"car": 0.625, "person": 1.0}
     assert values["class_uncertain"]["car"] == 1
     assert values["uncertain"] == pytest.approx(1 / 3)
-
-
-def test_wrong_options_are_refused_before_any_work(labelling: Labelling) -> None:
-    fails(lambda: replace(labelling, kind="mcap"), "mcap")
-    fails(lambda: replace(labelling, method="rv", uncertain=True), "--uncertain")
-    fails(lambda: replace(labelling, tau=2.0), "tau")
-    fails(lambda: replace(labelling, batch=0), "batch", "at least 1")
 
 
 def test_files_of_any_storage_of_fsspec_are_read_and_written() -> None:

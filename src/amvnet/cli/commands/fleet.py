@@ -1,0 +1,60 @@
+"""The verb `fleet`."""
+
+from __future__ import annotations
+
+from amvnet.cli.console import progress, say
+from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice
+from amvnet.config.bounds import Count
+from amvnet.errors import import_optional
+from amvnet.models.methods import Compute
+from amvnet.progress import counted
+
+
+def fleet(
+    inputs: list[str],
+    /,
+    weights: str,
+    out: str,
+    known: SensorChoice,
+    compute: Compute,
+    labels: LabelChoice,
+    columns: str | None = None,
+    dtype: str | None = None,
+    batch: Count = 1,
+    resume: bool = False,
+    address: str | None = None,
+    workers: Count | None = None,
+) -> None:
+    """Label scans in object storage on a Ray cluster, and write a table of results.
+
+    Args:
+        inputs: folders of scan files, scan files, or manifests (.parquet, .csv): URLs or paths.
+        weights: a weights file, or the name of a built-in one.
+        out: folder for the labels: a URL or a path; new, or with --resume that of an earlier run.
+        known: what is known of the sensor of scan files.
+        compute: where and how the networks are computed.
+        labels: how points are labelled, and which files are written.
+        columns: as of predict.
+        dtype: as of predict.
+        batch: scans that go through the networks at a time; more than one suits a GPU.
+        resume: continue an earlier run into the folder: label only the scans that are new, failed,
+            or whose labels are gone, with the same weights and options.
+        address: the Ray cluster: auto, ray://HOST:10001, ...; default: Ray starts on this machine.
+        workers: at most so many; default: one for each GPU, or for each 4 cores.
+    """
+    from amvnet.weights.file import load
+
+    on_ray = import_optional("amvnet.fleet.on_ray", "fleet")
+    choice = ScanChoice(columns=columns, dtype=dtype)
+    request = labels.parse(load(weights), choice, known, compute)
+    with progress("labelling") as step:
+        written = on_ray.label_fleet(
+            inputs,
+            request,
+            out,
+            on_ray.Cluster(address, workers, compute, batch),
+            resume=resume,
+            progress=step,
+            say=say,
+        )
+    say(f"{counted(written, 'label file')} in {out}; the table of results is in {out}/results")

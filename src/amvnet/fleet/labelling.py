@@ -1,0 +1,275 @@
+"""What the workers of a fleet do: measure the sensors of drives, and label scan files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import socket
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from amvnet import load
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.detect import BAGS, FOLDER, ending_of
+from amvnet.data.formats.find import NamedScan
+from amvnet.data.formats.registry import read_file
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import InputError, without_secrets
+from amvnet.files import temporary_folder
+from amvnet.fleet.manifest import split_name
+from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, results_schema
+from amvnet.fleet.storage import Place
+from amvnet.inference.listing import FileReader, FileScan
+from amvnet.inference.pipeline import Outcome, Pipeline
+from amvnet.inference.predict import segment_by
+from amvnet.inference.reading import normaliser_for
+from amvnet.inference.request import LabellingRequest
+from amvnet.inference.scan_stream import AHEAD
+from amvnet.inference.segmentation import Segmentation, uncertain_share
+from amvnet.models.methods import Compute
+from amvnet.progress import Say, say_nothing
+from amvnet.runtime.memory import keep_freed_memory
+
+TRANSFERS = 8  # files that are read from, or written to, object storage at the same time
+IS_FATAL = pa.field("is_fatal", pa.bool_())  # whether no other scan can be written either
+DEFAULTS = Compute()
+
+Row = dict[str, Any]
+
+
+class LabelScans:
+    """Label scan files: for `map_batches` of Ray Data with `batch_format="pyarrow"`.
+
+    A batch is a table with a row for each scan and the columns `path`, `name`, `drive` and
+    `estimates`; only the first is needed. The column `estimates` holds what `MeasureSensors` has
+    found out about the drive's sensor; without it, the sensor is measured on the first scans of the
+    drive in the batch. So scans of one drive should follow one another.
+
+    Args:
+        request: how the scans are labelled, and what is written.
+        out: URL or path of the output folder.
+        compute: the device, and the scans that are computed at the same time; the request has the
+            engine and the precision.
+        batch: scans that go through the networks together.
+
+    Raises:
+        InputError: if this machine lacks the device, or a library for the engine.
+    """
+
+    def __init__(
+        self, request: LabellingRequest, out: str, compute: Compute = DEFAULTS, batch: int = 1
+    ) -> None:
+        self.request = request
+        self.batch = batch
+        self._segmenter = load(
+            request.weights,
+            compute.device,
+            request.method,
+            request.precision,
+            request.engine,
+            tau=request.tau,
+        )
+        if compute.at_once is not None:
+            self._segmenter.at_once = compute.at_once
+        if self._segmenter.device == "cpu":
+            keep_freed_memory()
+        self._schema = results_schema(request.taxonomy).append(IS_FATAL)
+        self._out = Place.of(out)
+        self._worker = f"{socket.gethostname()}:{os.getpid()}"
+        digests = "".join(request.settings["weights"].values())
+        self._digest = hashlib.sha256(digests.encode()).hexdigest()[:16]
+
+    def __call__(self, batch: pa.Table) -> pa.Table:
+        """Return the rows of the table of results for the scans of a batch."""
+        rows: list[Row] = []
+        scans = [_complete(row) for row in batch.to_pylist()]
+        for _, drive in groupby(scans, key=itemgetter("drive")):
+            rows += self._label_or_explain(list(drive))
+        return pa.Table.from_pylist(rows, self._schema)
+
+    def _label_or_explain(self, drive: Sequence[Row]) -> list[Row]:
+        """Label scans of one drive; after a fault of a library, one by one to find the scan."""
+        try:
+            return self._label(drive)
+        except Exception as error:
+            if len(drive) == 1:
+                line = str(error)
+                if not isinstance(error, InputError):
+                    found = f"{type(error).__name__}: {line}"
+                    line = f"{_shown_path(drive[0])}: expected a scan, found {found}"
+                return [self._row(drive[0], error=" ".join(line.split()))]
+        # Alone, a scan must still be normalised by the first scans of the drive.
+        estimates = drive[0]["estimates"] or measure(drive, self.request)["estimates"]
+        rows = []
+        for row in drive:
+            rows += self._label_or_explain([row | {"estimates": estimates}])
+        return rows
+
+    def _label(self, drive: Sequence[Row]) -> list[Row]:
+        """Label scans of one drive."""
+        start = time.perf_counter()
+        request = self.request
+        reader = _make_reader(request)
+        if drive[0]["estimates"]:
+            assert reader.normaliser is not None
+            reader.normaliser.recall(drive[0]["drive"], parse_estimate(drive[0]["estimates"]))
+
+        with _fetch(drive, reader, request) as (scans, folder):
+            pipeline = Pipeline(
+                scans,
+                segment_by(self._segmenter, request.classes),
+                request.output(self._out.local or folder),
+                request.taxonomy,
+                batch=self.batch,
+                at_once=self._segmenter.at_once,
+            )
+            row_of = {scan.name: row for scan, row in zip(scans, drive, strict=True)}
+            rows = list(pipeline.stream(scans, partial(self._write, pipeline, row_of), AHEAD))
+
+        seconds = (time.perf_counter() - start) / len(drive)
+        return [row | {"seconds": seconds} for row in rows]
+
+    def _write(self, pipeline: Pipeline, row_of: Mapping[str, Row], outcome: Outcome) -> Row:
+        """Write the files of a scan, the labels last, and return its row of results."""
+        scan, loaded, result = outcome
+        row = row_of[scan.name]
+        if loaded is None or isinstance(result, InputError):
+            return self._row(row, error=str(result).replace(str(scan.path), _shown_path(row)))
+
+        paths = list(pipeline.output.files_of(scan))
+        try:
+            entry = pipeline.write(scan, loaded, result)
+            if self._out.local is None:
+                for path in reversed(paths):
+                    place = self._out / path.as_posix()
+                    place.write((pipeline.output.folder / path).read_bytes())
+        except InputError as error:
+            return self._row(row, error=str(error))
+        except OSError as error:
+            place_name = error.filename or self._out.url
+            return self._row(row, error=f"{place_name}: {error.strerror or error}", is_fatal=True)
+
+        labels = (self._out / paths[0].as_posix()).url
+        counts = statistics(result, self.request.taxonomy)
+        return self._row(row, labels=labels, points=entry.points, **counts)
+
+    def _row(self, row: Row, **values: Any) -> Row:
+        """Return a row of results: what is known of the scan, and some values."""
+        return {
+            "scan": row["name"],
+            "drive": without_secrets(row["drive"]),
+            "path": _shown_path(row),
+            "worker": self._worker,
+            "weights": self._digest,
+            "is_fatal": False,
+            **values,
+        }
+
+
+class MeasureSensors:
+    """Measure the sensors of drives on their first scans: for `map_batches`, as `LabelScans`."""
+
+    def __init__(self, request: LabellingRequest) -> None:
+        self.request = request
+
+    def __call__(self, batch: pa.Table) -> pa.Table:
+        """Return a row of the table of drives for each drive of a batch."""
+        rows = []
+        for _, drive in groupby(batch.to_pylist(), key=itemgetter("drive")):
+            rows.append(measure([_complete(row) for row in drive], self.request))
+        return pa.Table.from_pylist(rows, DRIVES_SCHEMA)
+
+
+def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
+    """Measure the sensor of a drive on its first scans; return its row in the table of drives."""
+    source = drive[0]["drive"]
+    assumed: list[str] = []
+    reader = _make_reader(request, assumed.append)
+    usual = None
+    # What cannot be read is a broken scan when it is labelled.
+    with suppress(Exception), _fetch(drive, reader, request) as (scans, _):
+        assert reader.normaliser is not None
+        usual = reader.normaliser.measure(source).usual
+        for scan, row in zip(scans, drive, strict=True):
+            with suppress(InputError):  # the line about the first scan that can be read
+                scan.load()
+                assumed = [line.replace(str(scan.path), _shown_path(row)) for line in assumed]
+                break
+    return describe_drive(source, assumed[0] if assumed else "", usual)
+
+
+def _make_reader(request: LabellingRequest, say: Say = say_nothing) -> FileReader:
+    return FileReader(normaliser_for(request.weights, request.sensor, say))
+
+
+@contextmanager
+def _fetch(
+    drive: Sequence[Row], reader: FileReader, request: LabellingRequest
+) -> Iterator[tuple[list[FileScan], Path]]:
+    """Yield the scans of a drive, whose files are fetched ahead, and a temporary folder."""
+    with (
+        temporary_folder() as temporary,
+        ThreadPoolExecutor(TRANSFERS) as pool,
+    ):
+        scans = []
+        for index, row in enumerate(drive):
+            folder = temporary / str(index)
+            place = Place.of(row["path"])
+            path = place.local or folder / Path(place.path).name
+            read = partial(_read_fetched, pool.submit(place.fetch, folder), request)
+            scan = NamedScan(row["name"], row["drive"], path, ending="", read=read)
+            reader.expect(scan)
+            scans.append(FileScan(scan, reader))
+        yield scans, temporary / "labels"
+
+
+def _read_fetched(fetching: Future[Path], request: LabellingRequest) -> Cloud:
+    path = fetching.result()
+    ending = ending_of(path)
+    if ending in (FOLDER, *BAGS):
+        found = "a recording of several" if ending in BAGS else "a folder"
+        raise InputError(
+            f"{path}: expected a file of one scan, found {found}; name the files of scans, or "
+            "segment it with amvnet predict"
+        )
+    return read_file(path, ending, request.layout)
+
+
+def _complete(row: Row) -> Row:
+    """Return the row of a scan with all columns; what is not known is empty."""
+    name = row.get("name") or split_name(Path(row["path"]).name)[0]
+    others = {key: row.get(key) or "" for key in ("drive", "estimates")}
+    return {"path": row["path"], "name": name, **others}
+
+
+def _shown_path(row: Row) -> str:
+    """Return the URL of a scan to show and to store."""
+    return without_secrets(row["path"])
+
+
+def statistics(result: Segmentation, taxonomy: Taxonomy) -> Row:
+    """Return what the table of results says of the labels of a scan."""
+    ids = result.labels
+    size = taxonomy.size + 1
+    counts = np.bincount(ids, minlength=size)
+    uncertain = np.bincount(ids[result.uncertain], minlength=size)
+    sums = np.bincount(ids, weights=result.scores.max(axis=1, initial=0), minlength=size)
+    means = [total / count if count else None for total, count in zip(sums, counts, strict=True)]
+
+    names = taxonomy.classes
+    return {
+        "uncertain": uncertain_share(ids, result.uncertain),
+        "class_points": dict(zip(names, counts[1:].tolist(), strict=True)),
+        "class_uncertain": dict(zip(names, uncertain[1:].tolist(), strict=True)),
+        "class_confidence": dict(zip(names, means[1:], strict=True)),
+    }

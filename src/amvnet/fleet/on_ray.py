@@ -1,0 +1,438 @@
+"""Label a fleet of scans: a pipeline of Ray Data on a Ray cluster."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+import signal
+import threading
+import warnings
+from collections import Counter
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from operator import itemgetter
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from amvnet.engines.precision import choose_precision
+from amvnet.errors import InputError, reason_of
+from amvnet.fleet.labelling import DEFAULTS, IS_FATAL, LabelScans, MeasureSensors
+from amvnet.fleet.manifest import NameSet, list_scans
+from amvnet.fleet.results import DRIVES, DRIVES_SCHEMA, Results, describe_drive, results_schema
+from amvnet.fleet.storage import Place
+from amvnet.inference.journal import Entry
+from amvnet.inference.pipeline import check_faults
+from amvnet.inference.predict import report
+from amvnet.inference.request import LabellingRequest
+from amvnet.models.methods import METHODS, Compute
+from amvnet.progress import Progress, Say, no_progress, say_nothing
+from amvnet.sensors.measure import MEASURED
+
+os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
+os.environ.setdefault("RAY_worker_niceness", "0")  # as `predict`, and not 15
+import ray
+import ray.data
+from ray.exceptions import RayError
+
+WINDOW = 256_000  # scans that are planned together
+BLOCK = 64  # scans that a worker takes at a time
+SAID = 10  # drives whose assumptions are printed
+
+OBJECT_STORE = 500_000_000  # bytes of shared memory, if Ray starts on this machine
+CORES = 4  # of a worker without a GPU, if the machine has them
+QUEUED = 2  # blocks that a worker has at a time, so that it need not wait for the next
+RETRIES = 2  # of a block whose worker ends
+MOST_LOST = 100  # blocks of a window whose workers end again and again
+ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-\[\]]+:\d+")
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """The workers of a run.
+
+    Attributes:
+        address: of a Ray cluster, such as `auto` or `ray://HOST:10001`; None starts Ray on this
+            machine.
+        workers: the largest number of workers; None leaves it to Ray, which starts as many as the
+            cluster has room for.
+        compute: where and how the networks are computed.
+        batch: scans that go through the networks together.
+    """
+
+    address: str | None = None
+    workers: int | None = None
+    compute: Compute = DEFAULTS
+    batch: int = 1
+
+
+def label_fleet(
+    inputs: Sequence[str],
+    request: LabellingRequest,
+    out: str,
+    cluster: Cluster,
+    *,
+    resume: bool = False,
+    progress: Progress = no_progress,
+    say: Say = say_nothing,
+) -> int:
+    """Label scan files on a Ray cluster, and write a table of results.
+
+    Args:
+        inputs: as `list_scans` takes them.
+        request: how the scans are labelled, and what is written.
+        out: URL or path of the output folder.
+        resume: go on with an earlier run into the same folder.
+        say: takes lines about what was assumed of the sensors, and how sure the labels are.
+
+    Returns:
+        The number of label files of these scans that exist, counted in the output folder.
+
+    Raises:
+        InputError: before anything is computed, if an input or the output folder cannot be used, or
+            the earlier run had another request; while scans are listed, if two have one name; if
+            the workers cannot run; at the end, if all scans are broken.
+        SomeBroken: at the end, if some scans are broken.
+        OSError: if labels cannot be written.
+    """
+    place = Place.of(out)
+    tables = list_scans(inputs, place)
+    first = next(tables)  # raises before a cluster is started
+    connect(cluster.address)
+    resources = share_cluster(cluster)
+    request = replace(request, precision=_precision(request, cluster, resources))
+    results = Results(place, request, resume=resume)
+
+    run = FleetRun(request, results, cluster, resources, progress, say)
+    try:
+        for window in _windows(chain([first], tables)):
+            remaining = run.plan(window)
+            run.measure(window)
+            run.label(remaining)
+    finally:
+        results.flush()
+    return run.finish()
+
+
+def _windows(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:
+    """Join tables until they have as many scans as are planned together."""
+    waiting: list[pa.Table] = []
+    for table in tables:
+        waiting.append(table)
+        if sum(map(len, waiting)) >= WINDOW:
+            yield pa.concat_tables(waiting)
+            waiting.clear()
+    if waiting:
+        yield pa.concat_tables(waiting)
+
+
+class FleetRun:
+    """A run over the scans of a fleet, window by window: plan, measure the drives, label.
+
+    Args:
+        request: how the scans are labelled.
+        results: takes the rows; has what an earlier run has done.
+        cluster: the workers.
+        resources: that each worker needs, as options of Ray.
+    """
+
+    def __init__(
+        self,
+        request: LabellingRequest,
+        results: Results,
+        cluster: Cluster,
+        resources: dict[str, Any],
+        progress: Progress = no_progress,
+        say: Say = say_nothing,
+    ) -> None:
+        self.request = request
+        self.results = results
+        self.cluster = cluster
+        self.resources = resources
+        self._progress = progress
+        self._say = say
+        self._paths = NameSet()  # that are written
+        self._names = NameSet()
+        self._planned = 0
+        self._taken = 0
+
+    def plan(self, window: pa.Table) -> pa.Table:
+        """Return the scans that are not done; raise InputError if two write the same file."""
+        names = window["name"].to_pylist()
+        for ending in self.request.endings:
+            is_new = self._paths.add([f"{name}{ending}" for name in names])
+            if not is_new.all():
+                raise InputError(
+                    f"expected scans of different names, found {names[is_new.argmin()]} twice; "
+                    "label them in two runs with two folders"
+                )
+        self._names.add(names)
+        remaining = window.filter(~self.results.done.has(names))
+        self._planned += len(remaining)
+        return remaining
+
+    def measure(self, window: pa.Table) -> None:
+        """Measure the drives that are new in a window, and write their table."""
+        first: dict[str, list[int]] = {}  # scans of each drive
+        for index, drive in enumerate(window["drive"].to_pylist()):
+            if drive not in self.results.estimates:
+                scans = first.setdefault(drive, [])
+                if len(scans) < MEASURED:
+                    scans.append(index)
+        if not first:
+            return
+
+        each = max(BLOCK // MEASURED, 1)
+        drives = list(first.values())
+        groups = [drives[start : start + each] for start in range(0, len(drives), each)]
+        blocks = [window.take(list(chain.from_iterable(group))) for group in groups]
+        rows = {drive: describe_drive(drive, "", None) for drive in first}
+        workers = self._on_workers(MeasureSensors, (self.request,), blocks, {"num_cpus": 1})
+        for table in workers:
+            rows |= {row["drive"]: row for row in table.to_pylist()}
+        self.results.add_drives(pa.Table.from_pylist(list(rows.values()), DRIVES_SCHEMA))
+        self._say_assumed(sorted(rows.values(), key=itemgetter("drive")))
+
+    def _say_assumed(self, rows: Sequence[dict[str, Any]]) -> None:
+        for row in rows[:SAID]:
+            self._say(row["assumed"] or f"{row['drive']}: expected scans to measure, found none")
+        if len(rows) > SAID:
+            place = self.results.folder / DRIVES
+            self._say(f"what is assumed of {len(rows) - SAID} more drives is in {place.url}")
+
+    def label(self, scans: pa.Table) -> None:
+        """Label scans of drives that are measured.
+
+        Raises:
+            InputError: if the workers cannot run.
+            OSError: if labels cannot be written.
+        """
+        lost = self._label_in_blocks(_with_estimates(scans, self.results.estimates), BLOCK)
+        # A scan among these ends its workers. One scan at a time shows which one.
+        lost = self._label_in_blocks(lost, 1)
+        if len(lost):
+            self._take(self._rows_of_lost(lost))
+
+    def _label_in_blocks(self, scans: pa.Table, size: int) -> pa.Table:
+        """Label scans in blocks of a size; return those whose workers have ended."""
+        blocks = [scans.slice(start, size) for start in range(0, len(scans), size)]
+        if not blocks:
+            return scans
+        cluster = self.cluster
+        arguments = (self.request, self.results.out.address, cluster.compute, cluster.batch)
+        done: set[str] = set()
+        most_lost = MOST_LOST if size > 1 else len(blocks)
+        tables = self._on_workers(LabelScans, arguments, blocks, self.resources, most_lost)
+        with closing(tables):
+            for rows in tables:
+                done.update(rows["scan"].to_pylist())
+                self._take(rows)
+        return scans.filter(pa.array([name not in done for name in scans["name"].to_pylist()]))
+
+    def _take(self, rows: pa.Table) -> None:
+        """Add rows to the results; raise OSError if one says that labels cannot be written."""
+        is_fatal = rows[IS_FATAL.name]
+        self.results.add(rows.filter(pc.invert(is_fatal)).drop_columns([IS_FATAL.name]))
+        for line in rows["error"].filter(is_fatal).to_pylist():
+            place, _, reason = line.rpartition(": ")
+            raise OSError(errno.EIO, reason, place)
+
+        self._taken += len(rows)
+        self._progress(self._taken, self._planned)
+
+    def _rows_of_lost(self, scans: pa.Table) -> pa.Table:
+        """Return the rows of scans that end every worker that reads them."""
+        rows = []
+        for scan in scans.to_pylist():
+            path = Place.of(scan["path"]).url
+            line = f"{path}: expected a scan, found a file that ends its reader; leave it out"
+            row = {"scan": scan["name"], "drive": scan["drive"], "path": path, "error": line}
+            rows.append(row | {IS_FATAL.name: False})
+        return pa.Table.from_pylist(rows, results_schema(self.request.taxonomy).append(IS_FATAL))
+
+    def _on_workers(
+        self,
+        kind: type[LabelScans] | type[MeasureSensors],
+        arguments: tuple[Any, ...],
+        blocks: Sequence[pa.Table],
+        resources: dict[str, Any],
+        most_lost: int = -1,
+    ) -> Generator[pa.Table]:
+        """Yield what workers make of blocks, except of those whose workers end again and again.
+
+        Args:
+            kind: the class of the workers; a worker takes one block at a time.
+            arguments: of the class.
+            most_lost: blocks that may be lost; -1 stands for any number.
+
+        Raises:
+            InputError: if the workers cannot be started, or more blocks are lost.
+        """
+        context = ray.data.DataContext.get_current()
+        context.enable_progress_bars = False
+        context.max_errored_blocks = most_lost
+        workers = self.cluster.workers
+        dataset = ray.data.from_arrow(list(blocks)).map_batches(
+            Worker,
+            fn_constructor_args=(kind, ray.put(arguments)),
+            batch_size=None,
+            batch_format="pyarrow",
+            compute=ray.data.ActorPoolStrategy(
+                min_size=1,
+                max_size=None if workers is None else min(workers, len(blocks)),
+                max_tasks_in_flight_per_actor=QUEUED,
+            ),
+            max_task_retries=RETRIES,
+            **resources,
+        )
+        try:
+            yield from dataset.iter_batches(batch_size=None, batch_format="pyarrow")
+        except RayError as error:
+            raise InputError(_reason(error)) from error
+
+    def finish(self) -> int:
+        """Say how sure the labels are; return the number of label files that exist.
+
+        Raises:
+            InputError: if all scans are broken.
+            SomeBroken: if some are.
+        """
+        faults: list[str] = []
+        written = 0
+        points: Counter[str] = Counter()  # by drive
+        uncertain: Counter[str] = Counter()
+        for _, table, is_done in self.results.read():
+            is_ours = self._names.has(table["scan"].to_pylist())
+            written += int((is_ours & is_done).sum())
+            columns = ["path", "labels", "drive", "points", "uncertain", "error"]
+            rows = table.select(columns).filter(pa.array(is_ours)).to_pylist()
+            for row, has_labels in zip(rows, is_done[is_ours], strict=True):
+                if has_labels:
+                    points[row["drive"]] += row["points"]
+                    uncertain[row["drive"]] += round(row["uncertain"] * row["points"])
+                else:
+                    lost = f"{row['path']}: expected its labels in {row['labels']}, found none; "
+                    faults.append(row["error"] or f"{lost}label it again with --resume")
+
+        if METHODS[self.request.method].has_two_networks:
+            usual = self.request.weights.usual_uncertain_at(self.request.tau)
+            drives = [Entry("", "", drive, points[drive], uncertain[drive]) for drive in points]
+            report(drives, usual, self._say)
+        check_faults(faults, len(self._names))
+        return written
+
+
+class Worker:
+    """An actor of Ray Data.
+
+    Args:
+        kind: the class that does the work.
+        arguments: refers to its arguments, which Ray copies to each machine once.
+    """
+
+    def __init__(self, kind: type[LabelScans] | type[MeasureSensors], arguments: Any) -> None:
+        self.work = kind(*ray.get(arguments))
+
+    def __call__(self, batch: pa.Table) -> pa.Table:
+        return self.work(batch)
+
+
+def _with_estimates(scans: pa.Table, estimates: dict[str, str]) -> pa.Table:
+    """Return scans as `LabelScans` takes them, those of each drive one after the other."""
+    order: dict[str, list[int]] = {}
+    for index, drive in enumerate(scans["drive"].to_pylist()):
+        order.setdefault(drive, []).append(index)
+    scans = scans.take(pa.array(chain.from_iterable(order.values()), pa.int64()))
+    of_each = [estimates[drive] for drive in scans["drive"].to_pylist()]
+    return scans.append_column("estimates", pa.array(of_each, pa.string())).combine_chunks()
+
+
+# ---- Ray
+
+
+def connect(address: str | None = None) -> None:
+    """Connect this process to a Ray cluster, unless it is already.
+
+    Args:
+        address: as in `Cluster`.
+
+    Raises:
+        InputError: if the text is no address, or there is no cluster at it.
+    """
+    if address is not None and not ADDRESS.fullmatch(address):
+        raise InputError(
+            f"--address: expected an address such as auto or ray://HOST:10001, found {address!r}; "
+            "leave it out to start Ray on this machine"
+        )
+    if ray.is_initialized():
+        return
+    options: dict[str, Any] = {"address": address or "local"}
+    if address is None:
+        options |= {"include_dashboard": False, "object_store_memory": OBJECT_STORE}
+
+    warnings.filterwarnings("ignore", module=r"ray\.")
+    # Without max_task_retries, Ray Data would try a scan that ends its workers for ever.
+    warnings.filterwarnings("ignore", message="`ray_remote_args` is deprecated")
+    try:
+        with _own_signals():
+            ray.init(**options, log_to_driver=False, logging_level=logging.CRITICAL)
+    except Exception as error:  # Ray raises this class itself
+        raise InputError(
+            f"--address {address or ''}: expected a Ray cluster, found {reason_of(error)}; start "
+            "one with ray start --head, or leave the address out"
+        ) from None
+    for name in ("ray.data", "ray.data._internal"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+@contextmanager
+def _own_signals() -> Iterator[None]:
+    """Keep the handlers of signals: Ray's would abort the process without a word."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    if threading.current_thread() is threading.main_thread():
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def share_cluster(cluster: Cluster) -> dict[str, Any]:
+    """Return what each worker needs, as options of Ray: a GPU, or else some cores.
+
+    Raises:
+        InputError: if the device is a GPU, and the cluster has none.
+    """
+    available = ray.cluster_resources()
+    cores = int(available.get("CPU", 1))
+    gpus = int(available.get("GPU", 0))
+    device = cluster.compute.device
+    if device.startswith("cuda") and not gpus:
+        raise InputError("--device: expected a cluster with a GPU, found none; leave it out")
+    if gpus and device != "cpu":
+        return {"num_gpus": 1, "num_cpus": 1}
+    of_nodes = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
+    smallest = min(filter(None, of_nodes), default=CORES)  # some clusters start without workers
+    return {"num_cpus": max(min(CORES, smallest, cores // (cluster.workers or 1)), 1)}
+
+
+def _precision(request: LabellingRequest, cluster: Cluster, resources: dict[str, Any]) -> Any:
+    """Return the precision of all workers: "auto" is what it stands for on the first one."""
+    if request.precision != "auto" or "num_gpus" not in resources:
+        return choose_precision(request.precision, "cpu")
+    device = cluster.compute.device
+    choose = ray.remote(**resources)(choose_precision)
+    return ray.get(choose.remote("auto", "cuda" if device == "auto" else device))
+
+
+def _reason(error: BaseException) -> str:
+    """Return the line of an error on a worker, without its traceback."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    own = [line for line in lines if "InputError: " in line]
+    if own:
+        return own[-1].rpartition("InputError: ")[2]
+    reason = lines[-1] if lines else repr(error)
+    return f"expected workers that run, found {reason[:200]}; check the logs of the cluster"
