@@ -59,7 +59,7 @@ class Runner(OnnxSegmenter):
         scores = {"rv": f, "bev": g, "ensemble": np.sqrt(f * g)}
         if self.method == "amvnet":
             merged = scores["ensemble"].copy()
-            merged[uncertain] = self._settle(points, f, g, uncertain)
+            merged[uncertain] = self._classify(points, f, g, uncertain)
             scores["amvnet"] = merged
 
         labels = {name: values.argmax(axis=1) + 1 for name, values in scores.items()}

@@ -86,7 +86,7 @@ def without_joining() -> None:
 def without_sharing() -> None:
     """Compute the head's first layer for every neighbour of every uncertain point."""
 
-    def settle(
+    def classify(
         self: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor
     ) -> Tensor:
         table = point_table(points, f, g)
@@ -96,7 +96,7 @@ def without_sharing() -> None:
             logits.append(self(point, rows))
         return torch.cat(logits).softmax(dim=1)
 
-    PointHead.settle = settle  # type: ignore[method-assign]
+    PointHead.classify = classify  # type: ignore[method-assign]
 
 
 UNCHANGED = "as it is"

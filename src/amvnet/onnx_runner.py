@@ -160,7 +160,7 @@ class OnnxSegmenter:
         uncertain = disagree(self.assertion, f, g)
         merged = np.sqrt(f * g)
         if self.method == "amvnet" and uncertain.any():
-            merged[uncertain] = self._settle(points, f, g, uncertain)
+            merged[uncertain] = self._classify(points, f, g, uncertain)
         return merged, uncertain
 
     def score_range_view(self, scan: Scan) -> np.ndarray:
@@ -188,7 +188,7 @@ class OnnxSegmenter:
         slot = np.searchsorted(occupied, pillar)
         return softmax(scores.reshape(len(occupied), c.vertical, -1)[slot, voxel])
 
-    def _settle(
+    def _classify(
         self, points: np.ndarray, f: np.ndarray, g: np.ndarray, uncertain: np.ndarray
     ) -> np.ndarray:
         """Return (U, K) class probabilities of the uncertain points by the point head."""

@@ -30,7 +30,7 @@ from lidarstreets import simulate
 from fixtures.engines import scripted, sure_of
 from fixtures.worlds import fresh_weights, street
 
-PART = 2000  # uncertain points that the plain model settles at a time
+PART = 2000  # uncertain points that the plain model classifies at a time
 
 
 def test_a_segmenter_labels_what_its_engine_scores() -> None:

@@ -317,7 +317,7 @@ def test_only_the_points_that_occur_are_selected() -> None:
     assert torch.equal(table[k], whole[near])
 
 
-def test_a_scan_of_many_uncertain_points_is_settled_by_sectors_with_the_same_result(
+def test_a_scan_of_many_uncertain_points_is_classified_by_sectors_with_the_same_result(
     random_scan: RandomScan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = whole_model()
@@ -328,19 +328,19 @@ def test_a_scan_of_many_uncertain_points_is_settled_by_sectors_with_the_same_res
     with torch.inference_mode():
         expected = model.refine(batch, f, g, uncertain)
 
-        settled: list[int] = []
+        classified: list[int] = []
         score = model.point_head.score
 
         def counted(table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
-            settled.append(len(uncertain))
+            classified.append(len(uncertain))
             return score(table, uncertain, near)
 
         monkeypatch.setattr(model.point_head, "score", counted)
         monkeypatch.setattr(point_head_module, "AT_ONCE", 64)
         h = model.refine(batch, f, g, uncertain)
 
-    assert max(settled) == 64
-    assert sum(settled) == uncertain.sum()
+    assert max(classified) == 64
+    assert sum(classified) == uncertain.sum()
     torch.testing.assert_close(h, expected)
 
 

@@ -1,7 +1,7 @@
-// AMVNet, step by step as in the paper: project, score twice, compare, settle what is uncertain, merge.
+// AMVNet, step by step as in the paper: project, score twice, compare, classify what is uncertain, merge.
 
 import { geometricMean, labelsOf, merged, similarityOf } from "./fusion.js";
-import { settle } from "./head.js";
+import { classify } from "./head.js";
 import { nearestOthers } from "./neighbours.js";
 import { polarGrid } from "./polar_view.js";
 import { rangeImage } from "./range_view.js";
@@ -35,7 +35,7 @@ export async function segment(networks, { points, rows }, step) {
   if (method === "amvnet") {
     const index = Uint32Array.from(uncertain.keys()).filter((i) => uncertain[i]), n = description.point_head.neighbours;
     const neighbours = await step("neighbours", () => (index.length ? nearestOthers(points, index, n) : index));
-    const head = await step("point head", () => settle(networks, { points, f, g, uncertain: index, neighbours }));
+    const head = await step("point head", () => classify(networks, { points, f, g, uncertain: index, neighbours }));
     scores.amvnet = await step("merge", () => merged(scores.ensemble, index, head, k));
   }
   return { scores, labels: labelsOfAll(scores, k), similarity, uncertain };

@@ -6,7 +6,7 @@ const PART = 2048;  // uncertain points at a time, which bounds the memory
  * Return the head's probabilities (u K) of uncertain points (u), given the points (4 p), both networks' probabilities
  * f and g (p K), and the neighbours (u n) of the uncertain points.
  */
-export async function settle(networks, { points, f, g, uncertain, neighbours }) {
+export async function classify(networks, { points, f, g, uncertain, neighbours }) {
   const { k, description } = networks, scale = Math.fround(description.point_head.position_scale);
   const width = 2 * k + 4, n = neighbours.length / uncertain.length, scores = new Float32Array(uncertain.length * k);
 

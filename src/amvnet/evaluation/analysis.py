@@ -22,8 +22,8 @@ from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan
 
-BINS = 100  # of the cosine similarity, which lies in [0, 1]
-SWEPT = 98  # bins that the head settles at the largest tau, 0.98
+BINS = 100  # number of equal bins of the cosine similarity, which lies in [0, 1]
+SWEPT = 98  # number of bins that the head classifies at the largest tau, 0.98
 
 # AMVNet with one value of a parameter: the value, and in percent the uncertain points, the mIoU and
 # the accuracy.

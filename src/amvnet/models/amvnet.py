@@ -36,10 +36,10 @@ class Scores:
     """Class probabilities of P points.
 
     Attributes:
-        merged: (P, K) y, by AMVNet or another method.
+        merged: y (P, K), computed by AMVNet or another method.
         uncertain: (P,) bool, the points on which the two networks disagree.
-        rv: (P, K) f, by the range view's network; None if it did not run.
-        bev: (P, K) g, by the bird's-eye view's network; None if it did not run.
+        rv: f (P, K) of the range view's network; None if it did not run.
+        bev: g (P, K) of the bird's-eye view's network; None if it did not run.
     """
 
     merged: Tensor
@@ -53,7 +53,8 @@ class LateFusion(nn.Module):
 
     Args:
         assertion: decides which points are uncertain.
-        point_head: classifies the uncertain points; None for the ensemble of the two networks.
+        point_head: classifies the uncertain points. If it is None, the ensemble of the two
+            networks classifies them.
 
     Attributes:
         ensemble: combines f and g for the certain points, by the geometric mean as in the paper.
@@ -92,7 +93,7 @@ class LateFusion(nn.Module):
             with self.watch("neighbours"):
                 near = nearest_neighbours(points, index, self.point_head.config.neighbours)
             with self.watch("head"):
-                parts.append(self.point_head.settle(points, f[scan], g[scan], index, near))
+                parts.append(self.point_head.classify(points, f[scan], g[scan], index, near))
         return concatenate(parts)
 
     def merge(self, f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
@@ -154,11 +155,15 @@ class AMVNet(LateFusion):
 
 
 def replace_uncertain(y: Tensor, uncertain: Tensor, h: Tensor) -> Tensor:
-    """Return y (P, K) with the rows h (U, K) of the U uncertain points; on a CPU y is changed."""
+    """Return y (P, K) with the rows of the U uncertain points replaced by h (U, K).
+
+    On a CPU, y itself is changed.
+    """
     if y.is_cpu:
         return y.index_put_((uncertain,), h)
 
-    # `index_put` would make the CPU wait for the GPU; on a CPU it takes half the time of this.
+    # On a GPU, `index_put` would make the CPU wait. On a CPU, it is twice as fast as
+    # `masked_scatter`.
     return y.masked_scatter(uncertain[:, None], h)
 
 

@@ -1,4 +1,4 @@
-"""The assertion: finds uncertain points by the two networks' scores (section 3.2)."""
+"""The assertion finds uncertain points by comparing the two networks' scores (section 3.2)."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torch import Tensor
 
 from amvnet.errors import InputError
 
-TINY = 1e-12  # keeps the cosine of scores without length finite
+TINY = 1e-12  # smallest divisor; it keeps the cosine of all-zero scores finite
 
 
-# Returns u (P,) bool, True if a point is uncertain, given the class probabilities f and g (P, K) of
-# the two networks and the points (P, 4): x, y, z in metres and intensity in [0, 1].
+# Takes the class probabilities f and g (P, K) of the two networks, and the points (P, 4): x, y, z
+# in metres and intensity in [0, 1]. Returns u (P,) bool, True if a point is uncertain.
 Assertion = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """The paper's assertion: uncertain if the cosine similarity of f and g is at most tau."""
+    """The paper's assertion: a point is uncertain if the cosine similarity is at most tau."""
 
     tau: float = 0.85
 
     def __post_init__(self) -> None:
-        if not 0 <= self.tau <= 1:  # nor NaN
+        if not 0 <= self.tau <= 1:  # this also refuses NaN
             raise InputError(f"expected tau from 0 to 1, found {self.tau}; give another")
 
     def __call__(self, f: Tensor, g: Tensor, points: Tensor) -> Tensor:
@@ -33,7 +33,7 @@ class Disagreement:
 
 
 def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
-    """Return the (P,) cosine similarity of class probabilities (P, K)."""
+    """Return the cosine similarity (P,) of class probabilities f and g (P, K)."""
     lengths = f.norm(dim=1) * g.norm(dim=1)
     similarity = torch.linalg.vecdot(f, g) / lengths.clamp_min(TINY)
     return similarity.clamp_max(1)  # rounding must not put a point beyond tau = 1

@@ -15,14 +15,14 @@ Pair = tuple[int, int]
 def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, stride: Pair, padding: Pair) -> Tensor:
     """Convolve as `torch.nn.functional.conv2d`: (B, C, H, W) -> (B, C', H', W').
 
-    On CPUs without AVX-512, oneDNN computes the gradient of the weights five times slower than
-    the convolution itself, which made it two thirds of a training step. There it is computed by
-    products of matrices instead.
+    With gradients, on CPUs without AVX-512: oneDNN takes five times as long for the gradient of
+    the weights as for the convolution itself. This was two thirds of a training step. Here matrix
+    products compute the gradient instead.
 
-    Without gradients, oneDNN also computes the convolutions with kernels of one cell. For these
-    `conv2d` calls MKL if there is one thread, which takes twice the time on an AMD processor.
+    Without gradients, for 1 x 1 kernels: with one thread, `conv2d` calls MKL, which takes twice as
+    long as oneDNN on an AMD processor. Here oneDNN is called directly.
     """
-    # Under autocast conv2d chooses the type, and an exporter has to see conv2d.
+    # Under autocast, conv2d chooses the type. An exporter has to see conv2d.
     is_plain = (
         x.is_cpu
         and x.dtype == weight.dtype == torch.float32
@@ -41,7 +41,7 @@ def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, stride: Pair, paddi
 
 
 class _Convolution(torch.autograd.Function):
-    """`torch.nn.functional.conv2d` without bias, with `weight_gradient` in its backward pass."""
+    """A convolution without bias whose backward pass calls `weight_gradient`."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, stride: Pair, padding: Pair) -> Tensor:
@@ -64,9 +64,10 @@ class _Convolution(torch.autograd.Function):
 def weight_gradient(x: Tensor, grad: Tensor, kernel: Pair, stride: Pair, padding: Pair) -> Tensor:
     """Return the gradient (C', C, kernel height, kernel width) of a convolution's weights.
 
-    The gradient of one tap is the product of the output's gradient (B, C', H', W') with the input
-    (B, C, H, W) that the tap sees. It is computed row by row: with the channels last in memory, the
-    pixels of a row form matrices that need no copy.
+    A tap is one cell of the kernel. Its gradient is a matrix product of the output's gradient
+    (B, C', H', W') and the part of the input (B, C, H, W) that the tap sees. The product is
+    computed row by row: if the channels are last in memory, a row of pixels is a matrix already,
+    and needs no copy.
     """
     height = (grad.shape[2] - 1) * stride[0] + 1
     width = (grad.shape[3] - 1) * stride[1] + 1

@@ -26,7 +26,7 @@ class RingConv2d(nn.Conv2d):
         super().__init__(channels, out, kernel, stride, padding=(kernel // 2, 0), bias=False)
         self.strides = stride
         self.wrap = kernel // 2
-        # The kernels of `upsampled_conv` by scale; None while the weight may still change.
+        # The kernels that `upsampled_conv` computes, by scale. None while the weight may change.
         self.kernels: dict[tuple[int, int], Tensor] | None = None
 
     def forward(self, input: Tensor) -> Tensor:
@@ -35,7 +35,10 @@ class RingConv2d(nn.Conv2d):
 
 
 def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
-    """Pad the width circularly, by at most W: (B, C, H, W) -> (B, C, H, left + W + right)."""
+    """Pad the width circularly: (B, C, H, W) -> (B, C, H, left + W + right).
+
+    `left` and `right` are at most W.
+    """
     if not left and not right:
         return x
 
@@ -43,12 +46,12 @@ def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
 
 
 def _pad_width(x: Tensor, left: int, right: int) -> Tensor:
-    # Unlike indexing, concatenating keeps the memory format.
+    # Concatenation keeps the memory format; indexing does not.
     return torch.cat([x[..., x.shape[-1] - left :], x, x[..., :right]], dim=-1)
 
 
 class _WrapWidth(torch.autograd.Function):
-    """`_pad_width` with a gradient that adds up the pads in place.
+    """`_pad_width` with a faster gradient, which adds the pads to the columns they copy in place.
 
     The gradient that autograd derives took a third of a training step.
     """
@@ -77,15 +80,15 @@ class PointLinear(nn.Linear):
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """Apply a linear layer to rows: (N, C), with a weight (C', C), -> (N, C').
+    """Apply a linear layer with weight (C', C) to rows: (N, C) -> (N, C').
 
-    Without gradients, it is computed on a CPU as a convolution with kernels of one cell. There
-    torch multiplies matrices by MKL, which leaves half or more of an AMD processor's float32
-    performance unused. oneDNN, which computes convolutions, does not; but the gradients of such a
-    convolution are slow.
+    On a CPU, torch multiplies matrices with MKL, which leaves half or more of an AMD processor's
+    float32 performance unused. oneDNN, which computes convolutions, does not. So without gradients
+    the layer is computed as a 1 x 1 convolution. With gradients it is not, because the gradients of
+    such a convolution are slow.
     """
     needs_gradient = torch.is_grad_enabled() and (x.requires_grad or weight.requires_grad)
-    # An exporter must not see the number of rows, which it would fix.
+    # An exporter would make the number of rows a constant, so it must not see it.
     if torch.compiler.is_compiling() or needs_gradient or not x.is_cpu:
         return F.linear(x, weight, bias)
     # A convolution does not take an empty image.
@@ -125,8 +128,8 @@ class ResidualBlock(nn.Module):
         self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:  # (B, C, H, W) -> (B, C', H / stride, W / stride)
-        # Subsampled here and not by a strided convolution: on a CPU, torch's strided convolution
-        # with kernels of one cell over few channels writes out of bounds.
+        # A strided convolution would also subsample. But on a CPU, torch's strided 1 x 1
+        # convolution over few channels writes out of bounds.
         subsampled = x[..., :: self.stride[0], :: self.stride[1]]
         return F.leaky_relu_(self.second(self.first(x)) + self.skip(subsampled), 0.01)
 
@@ -134,13 +137,13 @@ class ResidualBlock(nn.Module):
 class AzimuthGRU(nn.Module):
     """A GRU that runs once around the sensor over the cells of a map (section 3.1).
 
-    A unidirectional GRU of hidden size C reads the map (B, C, H, W) column by column, each from
-    top to bottom. Its outputs form a map (B, C, H, W) again. Copies of the last columns come before
-    the first one, so that the hidden state knows the other end of the scan; their outputs are
-    dropped.
+    A unidirectional GRU of hidden size C reads the map (B, C, H, W) column by column, and each
+    column from top to bottom. Its outputs form a map of the same shape. The GRU first reads copies
+    of the last columns, so that the hidden state knows the other end of the scan. The outputs for
+    these copies are dropped.
 
     Args:
-        padding: the columns that are copied, as a share of the width.
+        padding: share of the columns that are copied.
     """
 
     def __init__(self, channels: int, padding: float) -> None:
@@ -153,7 +156,7 @@ class AzimuthGRU(nn.Module):
         padding = round(self.padding * w)
         columns = wrap_width(x, padding, 0).permute(0, 3, 2, 1)  # (B, padding + W, H, C)
 
-        # In bfloat16 the recurrence would lose its state.
+        # bfloat16 is too coarse for the hidden state: the recurrence would lose it.
         with torch.autocast(x.device.type, enabled=False):
             outputs, _ = self.gru(columns.reshape(b, -1, c).to(next(self.gru.parameters()).dtype))
         return outputs.view(b, -1, h, c)[:, padding:].permute(0, 3, 2, 1)  # (B, C, H, W)
@@ -165,10 +168,10 @@ def upsample(x: Tensor, like: Tensor) -> Tensor:
 
 
 def freeze(module: nn.Module) -> None:
-    """Prepare a module in evaluation mode whose parameters do not change any more.
+    """Make a module in evaluation mode faster; afterwards its parameters must not change.
 
-    Batch norms are folded into the layers before them, so that the outputs stay the same up to
-    rounding and are faster to compute. What depends on parameters alone is computed once.
+    Batch norms are folded into the layers before them: the outputs are the same up to rounding.
+    Values that depend on parameters alone are computed once.
     """
     for layers in list(module.modules()):
         if not isinstance(layers, nn.Sequential):

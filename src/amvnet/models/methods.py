@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MethodName = Literal["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
-Precision = Literal["auto", "float32", "bfloat16", "float16"]  # of the two networks
+# The floating-point type in which the two networks are computed.
+Precision = Literal["auto", "float32", "bfloat16", "float16"]
 EngineName = Literal["torch", "onnx", "int8"]  # what runs the two networks
 Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]  # f, g: (P, K) -> (P, K)
 
@@ -26,24 +27,24 @@ class Compute:
     """Where and how the networks are computed."""
 
     device: str = "auto"
-    """cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU."""
+    """device of the networks: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU."""
     engine: EngineName = "torch"
-    """what runs the networks: torch, onnx (ONNX Runtime), or int8 (the same in 8-bit integers,
+    """what runs the networks: torch, onnx (ONNX Runtime), or int8 (ONNX Runtime in 8-bit integers,
     calibrated once; a few labels change)."""
     precision: Precision = "auto"
-    """of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32."""
+    """precision of the networks; auto: bfloat16 on a GPU, float32 on a CPU; float16 needs a GPU."""
     at_once: Count | None = None
-    """scans that are segmented at the same time on a CPU; default: one per core, if the memory
-    suffices."""
+    """number of scans segmented at the same time on a CPU; default: one per core, fewer if the
+    memory does not suffice."""
 
 
-ONNX_ENGINES = frozenset({"onnx", "int8"})  # both are ONNX Runtime
+ONNX_ENGINES = frozenset({"onnx", "int8"})  # engines that run ONNX Runtime
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 BOTH_NETWORKS = ("range_net", "polar_net")
 
 
 def geometric_mean(f: Tensor, g: Tensor) -> Tensor:
-    """Return the geometric mean, AMVNet's ensemble of certain points."""
+    """Return the geometric mean, which AMVNet uses for certain points."""
     return (f * g).sqrt_()
 
 
@@ -62,7 +63,7 @@ class Method:
     """One way to label points.
 
     Attributes:
-        title: in tables and figures.
+        title: its name in tables and figures.
         parts: the parts of a weights file that the method needs.
         ensemble: combines the class probabilities f and g of the two networks; None if the method
             is no ensemble.
@@ -92,7 +93,7 @@ PAPER_METHODS: tuple[MethodName, ...] = ("rv", "bev", "ensemble", "amvnet")  # T
 
 
 def title_of(name: str) -> str:
-    """Return the title of a method, or another name, such as `labels`, as it is."""
+    """Return the title of a method; return any other name, such as `labels`, unchanged."""
     return METHODS[name].title if name in METHODS else name
 
 

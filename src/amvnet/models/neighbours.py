@@ -7,24 +7,28 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
-FREQUENT_TIES = 0.001  # share of the queries with a tie; chance alone causes fewer
-LEAF = 32  # points; pykdtree's own 16 take longer to build and no less to search
-AT_ONCE = 2**17  # queries whose distances are in memory: a scan may have millions
+FREQUENT_TIES = 0.001  # share of queries with a tie above which ties are not due to chance
+LEAF = 32  # points per leaf; with pykdtree's default, 16, trees take longer to build
+AT_ONCE = 2**17  # queries answered at a time, to limit memory: a scan may have millions
 
-# Takes (Q, 3) queries; returns the (Q, m) indices of the nearest points, and whether others are as
-# near as the last of them, (Q,) bool.
+# Takes queries (Q, 3). Returns the indices (Q, m) of the m nearest points; and (Q,) bool, whether
+# another point is as near as the m-th (a tie).
 Query = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
-    """Return (U, n) int32 indices of the n nearest others of each point `own` (U,) of xyz (P, 3).
+    """Return (U, n) int32 indices of the n nearest other points of some points of a scan.
 
-    If a scan has fewer than n other points, the farthest is repeated. A lone point is its own
-    neighbour.
+    If the scan has fewer than n other points, the farthest is repeated. If it has only one point,
+    the point is its own neighbour.
 
-    pykdtree takes half of SciPy's time. If ties are frequent, SciPy chooses among points that are
-    as near as the n-th, so that labels do not depend on which library is installed. (A sixth of
-    the points of the real nuScenes scans at hand occur twice.)
+    pykdtree takes half of SciPy's time. If ties are frequent, SciPy breaks them, so that labels do
+    not depend on which library is installed. (In the real nuScenes scans at hand, a sixth of the
+    points occur twice.)
+
+    Args:
+        xyz: (P, 3), all points of the scan.
+        own: (U,) indices of the points whose neighbours are wanted.
     """
     nearest = np.empty((len(own), n), dtype=np.int32)
     if not len(own):
@@ -47,10 +51,13 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
 def _search(
     query: Query, xyz: np.ndarray, own: np.ndarray, rows: np.ndarray, nearest: np.ndarray
 ) -> np.ndarray:
-    """Write rows (R,) of `nearest`, the result of `nearest_others`, a part of them at a time.
+    """Write some rows of `nearest`, the result of `nearest_others`, in parts of `AT_ONCE` rows.
+
+    Args:
+        rows: (R,) indices of the rows to write.
 
     Returns:
-        (R,) bool, as a `Query` returns it.
+        (R,) bool, whether the last neighbour of each row has a tie; see `Query`.
     """
     is_tied = np.empty(len(rows), dtype=bool)
     for start in range(0, len(rows), AT_ONCE):
@@ -68,7 +75,7 @@ def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
     tree = KDTree(xyz, leafsize=LEAF)
 
     def query(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # One neighbour more than needed shows whether the m-th has a tie.
+        # The neighbour after the m-th shows whether the m-th has a tie.
         distances, nearest = tree.query(queries, k=m + 1)
         return nearest[:, :m].astype(np.int32), distances[:, -1] == distances[:, -2]
 
@@ -88,10 +95,15 @@ def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
 
 
 def _drop_self(nearest: np.ndarray, index: np.ndarray, n: int) -> np.ndarray:
-    """Return (U, n) neighbours without the points `index` (U,) themselves, given (U, m).
+    """Drop each point itself from its nearest points: (U, m) -> (U, n) indices.
 
-    The nearest are first. If there are fewer, the last one is repeated. If many points coincide, a
-    point may be missing from its own neighbours. Then the last one is dropped instead.
+    The nearest points come first. If fewer than n are left, the last one is repeated. If many
+    points coincide, a point may not be among its own nearest points; then the last one is dropped
+    instead.
+
+    Args:
+        nearest: (U, m) indices of the nearest points of each point.
+        index: (U,) indices of the points themselves.
     """
     if nearest.shape[1] > 1:
         if (nearest[:, 0] == index).all():  # the usual case: no points coincide

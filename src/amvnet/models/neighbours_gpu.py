@@ -1,7 +1,7 @@
-"""The nearest neighbours of points of a scan in plain tensor operations, exact, for a GPU.
+"""Find the exact nearest neighbours of points with plain tensor operations, for a GPU.
 
-The points are split into blocks. A point's neighbours are searched for in the blocks nearest to
-it, and among all points only if nearer ones may lie elsewhere.
+The points of a scan are split into blocks. A point's neighbours are first searched for in the
+blocks nearest to the point. If nearer points may lie in other blocks, all points are searched.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from torch.nn import functional as F
 
 from amvnet.models.views.points import concatenate
 
-BLOCK = 128  # points of a block, at most
+BLOCK = 128  # largest number of points in a block
 NEAREST = 8  # blocks searched for a point's neighbours; for most points 2 hold them all
-# Candidates beyond the n nearest in float32 that are ranked again in double precision. They also
+# The n + SPARE nearest points in float32 are ranked again in double precision. The spare ones also
 # make room for the point itself and for repeated points.
 SPARE = 16
 ROUNDING = 1e-6  # largest relative error of a squared distance in float32
-UNDERFLOW = 1e-37  # square metres; below, float32 is less exact than `ROUNDING`
-MEMORY = 2**30  # bytes that are used at a time
+UNDERFLOW = 1e-37  # square metres; below this, float32 is less exact than `ROUNDING`
+MEMORY = 2**30  # memory budget of one step, bytes
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """The P points of a scan in M blocks of B points that lie close together.
+    """The P points of a scan, divided into M blocks of B slots; points of a block lie close.
 
     Attributes:
-        xyz: (M * B, 3) metres, the P points of the scan; infinity after these.
-        index: (M, B) int64 indices into these; at least P in an unused slot.
-        points: (M, 3, B) metres; infinity in an unused slot.
+        xyz: (M * B, 3) metres, the P points of the scan, followed by infinities.
+        index: (M, B) int64 indices into `xyz`; P or more in an unused slot.
+        points: (M, 3, B) metres, the points of each block; infinity in an unused slot.
         low: (M, 3) lower corner of the box around each block.
         high: (M, 3) upper corner of the box around each block.
     """
@@ -46,10 +46,14 @@ class Blocks:
 
 
 def nearest_others_by_blocks(xyz: Tensor, own: Tensor, n: int) -> Tensor:
-    """Return (U, n) int64 indices of the n nearest others of each point `own` (U,) of xyz (P, 3).
+    """Return (U, n) int64 indices of the n nearest other points of some points of a scan.
 
-    The result is that of `amvnet.models.neighbours.nearest_others`, except for the choice among
-    points that are equally near. The tensors stay on their device.
+    `amvnet.models.neighbours.nearest_others` returns the same, except that it may choose others
+    among equally near points. The tensors stay on their device.
+
+    Args:
+        xyz: (P, 3), all points of the scan.
+        own: (U,) indices of the points whose neighbours are wanted.
     """
     others = min(n, len(xyz) - 1)
     if not len(own) or others < 1:
@@ -64,8 +68,8 @@ def nearest_others_by_blocks(xyz: Tensor, own: Tensor, n: int) -> Tensor:
 def split_into_blocks(xyz: Tensor) -> Blocks:
     """Split points (P, 3) into blocks of at most `BLOCK`.
 
-    Parts are cut into quarters across x and y in turn, and in the end into halves. The last cut is
-    across the longest side of each part's box.
+    All points are one part at first. Each step cuts every part into quarters, across x and y in
+    turn. The last cut is into halves, across the longest side of each part's box.
     """
     levels = max(0, math.ceil(math.log2(len(xyz) / BLOCK)))
     size = -(-len(xyz) >> levels)  # rounded up
@@ -90,7 +94,12 @@ def split_into_blocks(xyz: Tensor) -> Blocks:
 
 
 def _cut(index: Tensor, positions: Tensor, ways: int) -> Tensor:
-    """Cut each part (M, B) across an axis, given the positions along it: (M * ways, B / ways)."""
+    """Cut each part across an axis: (M, B) indices -> (M * ways, B / ways).
+
+    Args:
+        positions: (M, B) positions of the points along the axis.
+        ways: number of pieces of a part.
+    """
     return index.gather(1, positions.argsort(dim=1)).view(len(index) * ways, -1)
 
 
@@ -104,7 +113,7 @@ def _along_longest_side(xyz: Tensor, index: Tensor) -> Tensor:
 
 def _nearest(xyz: Tensor, own: Tensor, n: int) -> Tensor:
     """Return (U, n) indices of the nearest others in a scan with at least n other points."""
-    # Blocks are at least half full; those that are searched have to hold all candidates.
+    # Blocks are at least half full. The searched blocks have to hold all candidates.
     if len(xyz) <= NEAREST * BLOCK or n + SPARE > NEAREST * BLOCK // 2:
         return _nearest_of_all(xyz, own, n)
 
@@ -120,7 +129,7 @@ def _nearest(xyz: Tensor, own: Tensor, n: int) -> Tensor:
 
 
 def _nearest_in_blocks(blocks: Blocks, own: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Search the nearest blocks only.
+    """Search only the blocks nearest to each point.
 
     Returns:
         (U, n) indices of the nearest others, and (U,) bool: True if another point may be nearer.
@@ -128,12 +137,12 @@ def _nearest_in_blocks(blocks: Blocks, own: Tensor, n: int) -> tuple[Tensor, Ten
     queries = blocks.xyz[own]  # (U, 3)
     gaps, near = _gaps(blocks, queries).topk(NEAREST + 1, dim=1, largest=False)
 
-    # Squared distances in float32 to all points of the nearest blocks
+    # Compute squared distances in float32 to all points of the nearest blocks.
     index = blocks.index[near[:, :-1]].flatten(1)  # (U, NEAREST * B)
     offsets = blocks.points[near[:, :-1]] - queries[:, None, :, None]  # (U, NEAREST, 3, B)
     distance = offsets.square_().sum(dim=2).flatten(1)
 
-    # The best of them ranked again in double precision, and without the point itself
+    # Rank the nearest points again in double precision, without the point itself.
     rough, column = distance.topk(n + SPARE, dim=1, largest=False)
     index = index.gather(1, column)
     exact = (blocks.xyz[index] - queries[:, None].double()).square_().sum(dim=2)
@@ -162,7 +171,7 @@ def _nearest_of_all(xyz: Tensor, own: Tensor, n: int) -> Tensor:
 
 
 def _bytes_per_query(blocks: Blocks) -> int:
-    """Return the memory that the search for one point's neighbours in the blocks takes."""
+    """Return the memory that the search for one point's neighbours takes, in bytes."""
     to_boxes = 4 * 4 * len(blocks.low)  # offsets and distances
     per_point = 2 * 3 * 4 + 2 * 8 + 2 * 4  # coordinates, indices, distances
     return to_boxes + per_point * NEAREST * blocks.index.shape[1]

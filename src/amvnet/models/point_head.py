@@ -1,4 +1,4 @@
-"""The point head: classifies uncertain points from their neighbourhood (section 3.3)."""
+"""The point head classifies uncertain points from their neighbourhood (section 3.3)."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from amvnet.models.views.points import concatenate, occurring
 from amvnet.runtime.threads import run_parts
 
 POINT_VALUES = 4  # x, y, z, intensity
-LEAST = 1e-24  # product of two probabilities whose logarithm is still taken
-PART = 1024  # uncertain points encoded at a time, so that they fit into a CPU's cache
-PART_ON_GPU = 2**16  # the same for a GPU: enough to keep it busy
-AT_ONCE = 2**17  # uncertain points whose table is in memory: a scan may have millions of them
+LEAST = 1e-24  # lower bound of f * g, so that its logarithm is finite
+PART = 1024  # uncertain points encoded at a time on a CPU, so that they fit into its cache
+PART_ON_GPU = 2**16  # uncertain points encoded at a time on a GPU, enough to keep it busy
+AT_ONCE = 2**17  # uncertain points classified at a time, to limit memory
 
 
 class PointHead(nn.Module):
     """The network that classifies uncertain points.
 
-    Its inputs are the features p_i (U, 2 K + 4) of U uncertain points and the rows S_i
-    (U, n, 2 K + 4) of their n neighbours each, as `head_features` returns them. Its outputs are
-    logits (U, K). In evaluation mode they are those of the weighted geometric mean with the
-    ensemble of f_i and g_i, if `config.share` is below 1.
+    Its inputs are p_i (U, 2 K + 4), the features of U uncertain points, and S_i (U, n, 2 K + 4),
+    the rows of the n neighbours of each; `head_features` returns both. Its outputs are logits
+    (U, K). If `config.share` is below 1, the logits in evaluation mode are the weighted geometric
+    mean of the head's own scores and the ensemble of f_i and g_i.
     """
 
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
@@ -48,13 +48,15 @@ class PointHead(nn.Module):
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
         encoded = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1])
-        return self._classify(_pool(encoded), point)
+        return self._logits(_pool(encoded), point)
 
-    def settle(self, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
+    def classify(self, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
         """Return (U, K) class probabilities of some points of one scan.
 
         Args:
-            points: (P, 4), all points of the scan, with f and g, (P, K).
+            points: (P, 4), all points of the scan.
+            f: (P, K) class probabilities of all points by the range view's network.
+            g: (P, K) class probabilities of all points by the bird's-eye view's network.
             index: (U,) indices of the points to classify.
             near: (U, n) indices of their neighbours.
         """
@@ -65,13 +67,13 @@ class PointHead(nn.Module):
         return h
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
-        """Return the (U, K) logits of `forward(*head_features(...))`, at less cost.
+        """Return the logits (U, K), as `forward(*head_features(...))` does, but faster.
 
-        The first layer is computed once for each point instead of once for each neighbour:
+        The first layer is computed once for each point, not once for each neighbour of each point:
         W [f_k, g_k, x_k - x_i] = W [f_k, g_k, x_k] - W [0, 0, x_i].
 
         Args:
-            table: (P, 2 K + 4) of one scan, from `point_table`.
+            table: (P, 2 K + 4), the `point_table` of one scan.
             uncertain: (U,) indices of the uncertain points.
             near: (U, n) indices of their nearest neighbours.
         """
@@ -94,10 +96,10 @@ class PointHead(nn.Module):
         pooled = run_parts(pool_part, parts) if table.is_cpu else list(map(pool_part, parts))
 
         point[:, -POINT_VALUES:-1].mul_(self.config.position_scale)
-        return self._classify(concatenate(pooled), point)
+        return self._logits(concatenate(pooled), point)
 
-    def _classify(self, pooled: Tensor, point: Tensor) -> Tensor:
-        """Return the (U, K) logits."""
+    def _logits(self, pooled: Tensor, point: Tensor) -> Tensor:
+        """Return the logits (U, K), given the pooled neighbours (U, C) and p_i (U, 2 K + 4)."""
         logits = self.fc(torch.cat([pooled, point], dim=1))
         share = self.config.share
         if share == 1 or self.training:
@@ -109,23 +111,27 @@ class PointHead(nn.Module):
 
 
 def _pool(rows: Tensor) -> Tensor:
-    """Return the (U, C) maximum over the n neighbours, given (U, n, C) before the last ReLU."""
-    # ReLU is monotonic: after the maximum it gives the same for a fraction of the work.
+    """Apply the last ReLU and return the maximum over the neighbours: (U, n, C) -> (U, C)."""
+    # ReLU is monotonic, so the maximum may come first. Then ReLU has n times less to do.
     return F.relu(rows.amax(dim=1))
 
 
 def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
-    """Return [f, g, x] of points x (P, 4) with class probabilities f, g (P, K): (P, 2 K + 4)."""
+    """Return [f, g, x] (P, 2 K + 4) for points x (P, 4) and class probabilities f, g (P, K)."""
     return torch.cat([f, g, points], dim=1)
 
 
 def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
-    """Divide the points `index` (U,) of a scan's points (P, 4) by their azimuth.
+    """Divide some points of a scan into parts by their azimuth.
 
-    Each part and its neighbours are then few points.
+    Points of similar azimuth share neighbours, so that each part has few points and neighbours.
+
+    Args:
+        points: (P, 4), all points of the scan.
+        index: (U,) indices of the points to divide.
 
     Returns:
-        Places in `index`, at most `AT_ONCE` in each part; one part if there are not more points.
+        For each part, the places of its points in `index`; at most `AT_ONCE` of them.
     """
     if len(index) <= AT_ONCE:
         return [slice(None)]
@@ -137,10 +143,9 @@ def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
 def used_points_table(
     points: Tensor, f: Tensor, g: Tensor, *indices: Tensor
 ) -> tuple[Tensor, Sequence[Tensor]]:
-    """Return `point_table` for the points whose indices occur in any of the tensors `indices`.
+    """Return the `point_table` of the points whose indices occur in any of the tensors `indices`.
 
-    On a GPU it has all points, because the CPU would have to wait for the number of those that
-    occur.
+    On a GPU the table has all points. To select some, the CPU would have to wait for their number.
 
     Returns:
         The table, and the tensors `indices` as indices into it.
@@ -156,10 +161,15 @@ def used_points_table(
 def head_features(
     config: PointHeadConfig, table: Tensor, uncertain: Tensor, near: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return p_i = [f_i, g_i, x_i] (U, 2 K + 4) of uncertain points, and their S_i.
+    """Return the inputs p_i (U, 2 K + 4) and S_i (U, n, 2 K + 4) of the point head.
 
-    S_i (U, n, 2 K + 4) has the rows [f_k, g_k, x_k - x_i] of the neighbours `near` (U, n). The
-    table is that of `point_table`. The positions in p_i are scaled by `config.position_scale`.
+    p_i is [f_i, g_i, x_i], with the position in x_i scaled by `config.position_scale`. S_i has the
+    rows [f_k, g_k, x_k - x_i] of the neighbours k.
+
+    Args:
+        table: (P, 2 K + 4), the `point_table` of one scan.
+        uncertain: (U,) indices of the uncertain points.
+        near: (U, n) indices of their nearest neighbours.
     """
     point = table[uncertain]
     rows = table[near]
@@ -169,7 +179,12 @@ def head_features(
 
 
 def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
-    """Return the indices (U, n) of the `nearest_others` of points `index` (U,) of points (P, 4)."""
+    """Return the indices (U, n) of the nearest other points of some points of a scan.
+
+    Args:
+        points: (P, 4), all points of the scan.
+        index: (U,) indices of the points whose neighbours are wanted.
+    """
     if points.is_cuda:
         return nearest_others_by_blocks(points[:, :3], index, n)
 
@@ -178,7 +193,7 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
 
 
 def _layers(widths: tuple[int, ...]) -> list[nn.Module]:
-    """Return linear layers of these widths, each with batch norm and ReLU."""
+    """Return linear layers of the given widths, each followed by batch norm and ReLU."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [PointLinear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU(inplace=True)]

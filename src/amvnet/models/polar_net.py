@@ -13,13 +13,15 @@ from amvnet.models.layers import ConvBlock, PointLinear, linear
 from amvnet.models.upsampled_conv import joined
 from amvnet.models.views.polar_view import FEATURES, PolarGrid
 
-# Points that are encoded at a time.
-PART = 8192  # fits a processor's cache
-PART_ON_GPU = 2**18  # keeps a GPU busy
+PART = 8192  # points encoded at a time on a CPU, so that they fit into its cache
+PART_ON_GPU = 2**18  # points encoded at a time on a GPU, enough to keep it busy
 
 
 class PolarNet(nn.Module):
-    """Points in the polar grid -> logits (M, Z * K) of the M occupied pillars, K per voxel."""
+    """The network that takes a `PolarGrid` and returns the logits of its M occupied pillars.
+
+    The logits have the shape (M, Z * K): K for each of the Z voxels of a pillar.
+    """
 
     def __init__(self, config: PolarNetConfig, vertical: int, classes: int) -> None:
         super().__init__()
@@ -29,7 +31,7 @@ class PolarNet(nn.Module):
             PointLinear(config.point_widths[-1], config.pillar), nn.ReLU(inplace=True)
         )
 
-        # The U-Net, from fine to coarse and back.
+        # The U-Net goes from fine to coarse maps and back.
         self.first = _double(config.pillar, widths[0])
         self.down = nn.ModuleList()
         for fine, coarse in pairwise(widths):
@@ -48,8 +50,8 @@ class PolarNet(nn.Module):
         return grid.to_map(self.compress(self.pool(grid)))
 
     def decode(self, grid: PolarGrid, decoded: Tensor) -> Tensor:
-        """Return the logits (M, Z * K), given the map of the U-Net (B, widths[0], R, A)."""
-        # Most pillars are empty, and have no point to score.
+        """Return the logits (M, Z * K), given the U-Net's output (B, widths[0], R, A)."""
+        # Most pillars are empty and need no logits.
         return self.score(grid.at_pillars(decoded))
 
     def pool(self, grid: PolarGrid) -> Tensor:  # (F, point_widths[-1])
@@ -75,7 +77,7 @@ class PolarNet(nn.Module):
 
 
 class DropBlock(nn.Module):
-    """Drops squares of a map in training, and scales up what is left (Ghiasi et al., 2018)."""
+    """Drop squares of a map in training, and scale up the remaining cells (Ghiasi et al., 2018)."""
 
     def __init__(self, probability: float, size: int) -> None:
         super().__init__()
@@ -86,17 +88,17 @@ class DropBlock(nn.Module):
         if not self.training or not self.probability:
             return x
 
-        # An odd size, so that a square has a centre.
+        # The size has to be odd, so that a square has a centre.
         size = min(self.size, *x.shape[-2:])
         size -= 1 - size % 2
 
-        # A cell is dropped if a centre falls within the square around it, which has to happen with
-        # the given probability.
+        # A cell is dropped if a centre falls within the square around it. At this rate, that
+        # happens with the given probability.
         rate = 1 - (1 - self.probability) ** (1 / size**2)
         centres = torch.rand(x.shape[0], 1, *x.shape[-2:], device=x.device) < rate
         mask = 1 - F.max_pool2d(centres.to(x.dtype), size, stride=1, padding=size // 2)
 
-        # A mean, because a sum would overflow half precision.
+        # A sum would overflow half precision; a mean does not.
         kept_share = mask.mean(dtype=torch.float32).clamp_min(1 / mask.numel())
         return x * (mask / kept_share).to(x.dtype)
 
@@ -106,7 +108,7 @@ def _double(channels: int, out: int) -> nn.Sequential:
 
 
 def _point_mlp(widths: tuple[int, ...]) -> nn.Sequential:
-    """Return the shared MLP, with batch norm after the input and each layer but the last."""
+    """Return the shared MLP. Batch norm follows the input and each layer but the last."""
     layers: list[nn.Module] = [nn.BatchNorm1d(FEATURES)]
     for channels, out in pairwise((FEATURES, *widths[:-1])):
         layers += [PointLinear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]

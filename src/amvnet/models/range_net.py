@@ -11,12 +11,12 @@ from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
 from amvnet.models.upsampled_conv import joined
 from amvnet.models.views.range_view import CHANNELS
 
-FIRST_DECODED = 1  # the decoder uses the stages from the second on: width strides of 4 and more
-RECURRENT = 2  # number of the last stages that are followed by a GRU
+FIRST_DECODED = 1  # index of the first stage that the decoder uses; its width stride is 4
+RECURRENT = 2  # how many of the last stages are followed by a GRU
 
 
 class RangeNet(nn.Module):
-    """Range image (B, 6, H, W) -> logits (B, K, H, W)."""
+    """The network that takes range images (B, 6, H, W) and returns logits (B, K, H, W)."""
 
     def __init__(self, config: RangeNetConfig, classes: int) -> None:
         super().__init__()
@@ -38,8 +38,8 @@ class RangeNet(nn.Module):
         self.scores = nn.Conv2d(c.head, classes, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        # bfloat16 resolves a coordinate of 20 m to 0.1 m only: too coarse to tell a hedge from a
-        # wall.
+        # At 20 m, bfloat16 resolves a coordinate to 0.1 m only. This is too coarse to tell a hedge
+        # from a wall.
         with torch.autocast(image.device.type, enabled=False):
             full = self.stem(self.input_norm(image))
 
@@ -50,7 +50,10 @@ class RangeNet(nn.Module):
         return convolve(x, self.scores.weight, self.scores.bias, stride=(1, 1), padding=(0, 0))
 
     def encode(self, x: Tensor) -> list[Tensor]:
-        """Return the maps of width strides 2, 4, 8, ...; the last two after their GRUs."""
+        """Return the maps of all stages, with width strides 2, 4, 8, ...
+
+        The last `RECURRENT` maps are the outputs of the GRUs.
+        """
         maps = []
         first_recurrent = len(self.stages) - len(self.recurrent)
         for index, stage in enumerate(self.stages):
@@ -62,7 +65,7 @@ class RangeNet(nn.Module):
         return maps
 
     def decode(self, maps: list[Tensor]) -> Tensor:
-        """Upsample from the coarsest map to the finest; add the lateral map, convolve at each."""
+        """Go from the coarsest map to the finest: upsample, add the lateral map, and convolve."""
         decoded: Tensor | None = None
         for x, lateral, conv in reversed(list(zip(maps, self.lateral, self.decoder, strict=True))):
             side = lateral(x)
@@ -75,7 +78,7 @@ class RangeNet(nn.Module):
 
 
 def _stages(c: RangeNetConfig) -> list[nn.Module]:
-    """Return the stages, each of which halves the width in its first block."""
+    """Return the stages. The first block of each stage halves the width."""
     stages: list[nn.Module] = []
     channels = c.stem
     for width, blocks, stride in zip(c.widths, c.blocks, c.height_strides, strict=True):

@@ -1,4 +1,4 @@
-"""A convolution over an upsampled map joined with a fine one, at less cost."""
+"""A fast convolution over an upsampled map concatenated with a fine map."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ def joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
 def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Tensor:
     """Return `convolution(torch.cat([upsample(coarse, fine), fine], dim=1))`, for 3 x 3 kernels.
 
-    A convolution is linear, so that each map can be convolved alone and the results added. The
-    upsampled map repeats each value s times along an axis, so that 3 taps see at most 2 different
-    values: 2 taps on the coarse map with summed weights do the same, with another kernel for each
-    of the s positions within a coarse cell. This is half of the work.
+    A convolution is linear, so that each map can be convolved alone and the results added.
+    Upsampling repeats each value s times along an axis. So the 3 taps of a kernel see at most 2
+    different values, and 2 taps with summed weights on the coarse map do the same. Which weights
+    are summed depends on the position of the fine cell within its coarse cell, so that there are s
+    kernels. This is half of the work.
 
     Args:
-        coarse: (B, C, h, w). If H or W is not a multiple of h or w, the map is upsampled.
+        coarse: (B, C, h, w). If H is not a multiple of h, or W of w, the map is really upsampled.
         fine: (B, C', H, W).
     """
     scale = (fine.shape[2] // coarse.shape[2], fine.shape[3] // coarse.shape[3])
@@ -42,16 +43,16 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
 
 
 def _kernels(convolution: RingConv2d, weight: Tensor, scale: tuple[int, int]) -> Tensor:
-    """Return the kernels (s * s * C', C, taps, taps) for upsampled maps, of a weight (C', C, 3, 3).
+    """Return the kernels for a coarse map: weight (C', C, 3, 3) -> (s * s * C', C, taps, taps).
 
-    A frozen convolution keeps them. An exporter has to see how they are made.
+    A frozen convolution keeps its kernels. An exporter has to see how they are computed.
     """
     may_keep = not torch.is_grad_enabled() and not torch.compiler.is_compiling()
     kept = convolution.kernels if may_keep else None
     if kept is not None and scale in kept:
         return kept[scale]
 
-    # The sums of weights are exact enough only in the weights' own type.
+    # Autocast would sum the weights in a coarser type.
     with torch.autocast(weight.device.type, enabled=False):
         row_taps, column_taps = (_taps(size, weight) for size in scale)
         kernels = torch.einsum("pak,qbl,oikl->pqoiab", row_taps, column_taps, weight).flatten(0, 2)
@@ -61,22 +62,25 @@ def _kernels(convolution: RingConv2d, weight: Tensor, scale: tuple[int, int]) ->
 
 
 def _convolve_upsampled(x: Tensor, kernels: Tensor, scale: tuple[int, int]) -> Tensor:
-    """Convolve (B, C, h, w) upsampled, by `_kernels`, into (B, C', h * scale, w * scale).
+    """Convolve a coarse map as if it were upsampled: (B, C, h, w) -> (B, C', h * scale, w * scale).
 
     The width is continued circularly. Fine cell s * t + p, with p from -1 to s - 2, sees the coarse
-    cells t - 1 and t. So there is one kernel of 2 taps for each p. The fine cells of all t in a row
-    begin one cell before the first.
+    cells t - 1 and t. So there is one kernel of 2 taps for each p. Because p begins at -1, the row
+    of results begins one fine cell before the map.
+
+    Args:
+        kernels: as `_kernels` returns them for `scale`.
     """
     rows, columns = scale
     output = convolve(wrap_width(x, 1, 1), kernels, None, stride=(1, 1), padding=(1, 0))
     output = output.permute(0, 2, 3, 1)  # (B, h + 1, w + 1, s * s * C')
     b, h, w, _ = output.shape
 
-    # From the outputs of each coarse cell to a map of fine cells
+    # Lay the s * s outputs of each coarse cell out as fine cells.
     cells = output.unflatten(3, (rows, columns, -1)).transpose(2, 3)
     cells = cells.reshape(b, h * rows, w * columns, -1)
 
-    # Without the cells before the first and after the last
+    # Drop the fine cells before the map and after it.
     top = int(rows > 1)
     left = int(columns > 1)
     height = x.shape[2] * rows
@@ -85,10 +89,10 @@ def _convolve_upsampled(x: Tensor, kernels: Tensor, scale: tuple[int, int]) -> T
 
 
 def _taps(scale: int, like: Tensor) -> Tensor:
-    """Return (scale, taps, 3) ones and zeros: which of the 3 weights are summed for each tap.
+    """Return (scale, taps, 3): 1 where a weight is part of a tap's sum, else 0.
 
-    The first axis is the position of a fine cell within a coarse one, the second the taps on the
-    coarse map.
+    The first axis is the position of a fine cell within its coarse cell, the second the taps on
+    the coarse map, the third the 3 weights.
     """
     if scale == 1:
         return torch.eye(3, dtype=like.dtype, device=like.device)[None]

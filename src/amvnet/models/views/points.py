@@ -1,4 +1,4 @@
-"""The points of one or more scans in the form that the views and networks take."""
+"""The points of one or more scans as one batch, which the views and networks take."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ def occurring(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     This does what `torch.unique` does, without a sort.
 
     Returns:
-        The indices that occur (M,), ascending, and the tensors `indices` as indices into these.
+        The M indices that occur, ascending; and for each tensor in `indices`, the places of its
+        values among these M.
     """
-    # One place before the first index: the sum up to there is the number of smaller indices.
+    # With one place before the first, the cumulative sum counts the smaller indices.
     padded = torch.zeros(count + 1, dtype=torch.bool, device=indices[0].device)
     occurs = padded[1:]
     for index in indices:
@@ -45,14 +46,14 @@ class PointBatch:
     Attributes:
         points: (P, 4) float32: x, y, z in metres, intensity in [0, 1]; all finite.
         scan: (P,) int64: the scan that each point belongs to, 0..B - 1; ascending.
-        count: B.
+        count: B, the number of scans.
         ring: (P,) int64: index of the laser, 0 the lowest; -1 if it is unknown; None if no scan
             has rings.
         row: (P,) int64: row of the range image, 0 the top; -1 if it is unknown; None if no scan
             has rows.
         names: the names of the scans.
-        sizes: the number of points of each scan; empty if unknown, so that the CPU has to wait for
-            a GPU to count them.
+        sizes: the number of points of each scan. If it is empty, the points have to be counted, for
+            which the CPU waits for a GPU.
     """
 
     points: Tensor
@@ -71,12 +72,12 @@ class PointBatch:
         if isinstance(where, torch.dtype):
             return replace(self, points=self.points.to(where))
 
-        # From a GPU the copy has to block, or it could be read before it is complete.
+        # A copy from a GPU has to block. Otherwise it could be read before it is complete.
         to_gpu = torch.device(where).type == "cuda"
         return self._map(lambda values: values.to(where, non_blocking=to_gpu))
 
     def pin_memory(self) -> PointBatch:
-        """Return the batch in pinned memory; torch's data loaders call this too."""
+        """Return the batch in pinned memory. torch's data loaders also call this."""
         return self._map(Tensor.pin_memory)
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> PointBatch:
@@ -88,11 +89,11 @@ class PointBatch:
 
     @cached_property
     def cylindrical(self) -> Tensor:
-        """(3, P) radius, azimuth and height: metres and radians.
+        """Radius, azimuth and height of the points, (3, P) float64, in metres and radians.
 
-        In double precision, so that a point at a cell's border falls the same way on any device.
+        With double precision, a point at a cell's border falls into the same cell on any device.
         """
-        # Contiguous, for which some functions take a fraction of the time.
+        # Some functions are much faster on contiguous tensors.
         xyz = self.points.T[:3].to(torch.float64, memory_format=torch.contiguous_format)
         x, y, z = xyz
         x_squared, y_squared = xyz[:2].square()
@@ -108,8 +109,8 @@ class PointBatch:
     def of(cls, scans: Sequence[Scan], device: torch.device | str = "cpu") -> PointBatch:
         """Return a batch of the valid points (`Scan.valid`) of one or more scans, in order.
 
-        On their way to a GPU, points are copied once, into pinned memory, which torch reuses for
-        the next batch.
+        If the device is a GPU, points are first copied into pinned memory. torch reuses that memory
+        for the next batch.
         """
         valid = [scan.valid for scan in scans]
         sizes = tuple(int(np.count_nonzero(mask)) for mask in valid)
@@ -134,7 +135,7 @@ class PointBatch:
             sizes=sizes,
         )
         for index, (scan, mask, part) in enumerate(zip(scans, valid, batch.slices(), strict=True)):
-            which = slice(None) if mask.all() else mask  # a slice is not copied first
+            which = slice(None) if mask.all() else mask  # indexing by a slice makes no copy
             points.numpy()[part] = scan.points[which]
             scan_index[part].fill_(index)
             if ring is not None and scan.ring is not None:

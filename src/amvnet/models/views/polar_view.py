@@ -1,4 +1,4 @@
-"""The bird's-eye view: a scan in a polar grid of pillars, each a column of voxels."""
+"""The bird's-eye view: a scan in a polar grid of pillars. A pillar is a column of voxels."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ class PolarGrid:
     """A batch of scans in the polar grid, and the mapping back to the points.
 
     Attributes:
-        features: (S, 9) float32, of the points that the networks see: offset from the voxel's
-            centre (radius, angle, height), polar coordinates (radius, angle, height), x, y,
-            intensity; metres and radians.
+        features: (S, 9) float32, the features of the S points that the networks see: offset from
+            the voxel's centre (radius, angle, height), polar coordinates (radius, angle, height),
+            x, y, intensity; metres and radians.
         pillar: (P,) int64: each point's pillar, an index into the B * R * A pillars of the batch.
         voxel: (P,) int64: each point's voxel within its pillar; 0 is the lowest.
         occupied: (M,) int64: the pillars that hold points, ascending.
         slot: (P,) int64: each point's pillar as an index into `occupied`.
         seen: (F,) int64: the pillars that hold points which the networks see, ascending.
-        seen_slot: (S,) int64: the pillar of each of these points as an index into `seen`.
+        seen_slot: (S,) int64: the pillar of each point that the networks see, as an index into
+            `seen`.
         shape: (B, R, A, Z): scans, and cells along radius, angle and height.
     """
 
@@ -87,7 +88,7 @@ class PolarGrid:
         return maps.permute(0, 2, 3, 1).flatten(0, 2)[self.occupied]
 
     def to_points(self, scores: Tensor) -> Tensor:
-        """Return each point's scores (P, K): those of its voxel.
+        """Return the scores (P, K) of each point's voxel.
 
         Args:
             scores: (M, Z * K) logits or probabilities of the occupied pillars, voxel by voxel.
@@ -98,17 +99,17 @@ class PolarGrid:
 
 
 def _pillar_maximum(features: Tensor, slot: Tensor, pillars: int) -> Tensor:
-    """Return the maximum (F, C) of features (S, C) by their pillars `slot`."""
+    """Return the maximum (F, C) in each pillar of the features (S, C) with pillars `slot` (S,)."""
     zeros = features.new_zeros(pillars, features.shape[1])
     index = slot[:, None].expand_as(features)
     return zeros.scatter_reduce(0, index, features, "amax", include_self=False)
 
 
 class _PillarMaximum(torch.autograd.Function):
-    """`_pillar_maximum` with the same gradient, which takes a fraction of the time on a CPU.
+    """`_pillar_maximum` whose gradient is computed faster on a CPU.
 
-    Only the points that are the maximum of a channel have a gradient there. The gradient that
-    autograd derives passes over all points several times, which took a third of a training step.
+    In each channel, only the points that have the maximum have a gradient. The backward pass that
+    autograd derives reads all points several times, which took a third of a training step.
     """
 
     @staticmethod
@@ -122,11 +123,12 @@ class _PillarMaximum(torch.autograd.Function):
         features, slot, pooled = ctx.saved_tensors
         channels = features.shape[1]
 
-        # The largest values, as places in the flattened features and in the flattened maxima.
+        # Find the largest values: their places in the flattened features and in the flattened
+        # maxima.
         place = (features == pooled.index_select(0, slot)).flatten().nonzero()[:, 0]
         maximum = slot[place // channels] * channels + place % channels
 
-        # Equal largest values share the gradient.
+        # If several values are equally large, they share the gradient.
         sharing = torch.bincount(maximum, minlength=pooled.numel())
         values = (grads[0].flatten() / sharing)[maximum]
         gradient = torch.zeros_like(features)
@@ -142,9 +144,9 @@ class PolarView:
         self._axes_on: dict[torch.device, tuple[Tensor, ...]] = {}
 
     def _axes(self, device: torch.device) -> tuple[Tensor, ...]:
-        """Return the start, the length, the number and the last of the cells.
+        """Return the start and length of the axes, their numbers of cells, and their last cells.
 
-        Each is (3, 1) float64, along radius, angle and height.
+        Each is (3, 1) float64, for radius, angle and height.
         """
         if device not in self._axes_on:
             c = self.config
@@ -158,19 +160,19 @@ class PolarView:
     def project(self, batch: PointBatch) -> PolarGrid:
         """Return the polar grids of a batch of scans.
 
-        Points outside the grid go to its nearest cell. Points of the car's own body
-        (`PolarViewConfig.nearest`) are not seen, but have a voxel.
+        Points outside the grid go to its nearest cell. The networks do not see the points of the
+        car's own body (`PolarViewConfig.nearest`), but these points have a voxel.
         """
         c = self.config
 
-        # Python's numbers would be copied to a GPU.
+        # Python's numbers would be copied to a GPU each time.
         low, length, cells, last = self._axes(batch.points.device)
         polar = batch.cylindrical
         cell = (polar - low).div_(length).mul_(cells).floor_().clamp_min_(0).minimum(last)
         offset = polar - torch.addcdiv(low, (cell + 0.5).mul_(length), cells)
         radial_cell, angular_cell, voxel = cell.long()
 
-        # Not by a list of columns, which would have to be copied to a GPU.
+        # Columns are selected by slices: a list of columns would have to be copied to a GPU.
         xy = batch.points[:, :2]
         intensity = batch.points[:, 3:]
         features = torch.cat([offset.T.to(xy.dtype), polar.T.to(xy.dtype), xy, intensity], dim=1)
@@ -182,7 +184,7 @@ class PolarView:
         seen = occupied
         seen_slot = slot
         if c.nearest > 0:
-            # The processor waits once for a GPU, to know how many these are.
+            # The CPU waits once for a GPU, to know the number of far points.
             far = (batch.points[:, :3].norm(dim=1) >= c.nearest).nonzero()[:, 0]
             features = features.index_select(0, far)
             seen, (seen_slot,) = occurring(pillars, pillar.index_select(0, far))

@@ -1,4 +1,4 @@
-"""The range view: a scan as an image of lasers by azimuth."""
+"""The range view: a scan as an image, with lasers as rows and the azimuth as columns."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 
 CHANNELS = 6  # x, y, z, intensity, range, mask
-_INDEX_BITS = 32  # of the 64 bits of a key in `_nearest`: a point's index; above them is its range
+_INDEX_BITS = 32  # lower bits of a key in `_nearest`: a point's index; the upper bits: its range
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class RangeImage:
     nearest: Tensor
 
     def to_points(self, scores: Tensor) -> Tensor:
-        """Return each point's scores (P, K): those of its pixel.
+        """Return the scores (P, K) of each point's pixel.
 
         Args:
             scores: (B, K, H, W) logits or probabilities.
@@ -50,17 +50,17 @@ class RangeView:
     def project(self, batch: PointBatch) -> RangeImage:
         """Return the range images of a batch of scans.
 
-        Every point has a pixel; points above or below the field of view are in the first or the
-        last row. A pixel with several points shows the nearest to the sensor; of equally near
-        points, it shows the first. No pixel shows points of the car's own body
+        Every point has a pixel. Points above the field of view are in the first row, points below
+        it in the last. A pixel with several points shows the point nearest to the sensor; if
+        several are equally near, it shows the first. No pixel shows points of the car's own body
         (`RangeViewConfig.nearest`).
 
         Raises:
-            InputError: as `rows`.
+            InputError: if `rows` raises it.
         """
         c = self.config
 
-        # The row of zeros at the end is for pixels without a point.
+        # Pixels without a point take the row of zeros at the end.
         values = F.pad(batch.points, (0, 2, 0, 1))  # (P + 1, 6)
         values[:-1, 5] = 1
         distance = torch.linalg.vector_norm(batch.points[:, :3], dim=1, out=values[:-1, 4])
@@ -74,18 +74,21 @@ class RangeView:
         return RangeImage(image, pixel, nearest)
 
     def columns(self, batch: PointBatch) -> Tensor:
-        """Return the (P,) columns by azimuth: front (+x) in the middle, left (+y) to its left."""
+        """Return the columns (P,) of the points by their azimuth.
+
+        The front (+x) is in the middle of the image, the left (+y) in its left half.
+        """
         azimuth = batch.cylindrical[1]
         return _cells(0.5 - azimuth / (2 * math.pi), self.config.width)
 
     def rows(self, batch: PointBatch) -> Tensor:
-        """Return the (P,) rows of the points; 0 is the top.
+        """Return the rows (P,) of the points; 0 is the top.
 
-        A scan's own rows (`Scan.row`) take precedence over what the configuration says.
+        A scan's own rows (`Scan.row`) take precedence over the configured ones.
 
         Raises:
-            InputError: if a row is out of range; if rows are rings, and a scan without rows has no
-                ring indices or one is out of range.
+            InputError: if a row is out of range. If rows are configured to be rings: if a scan
+                without rows has no ring indices, or one of them is out of range.
         """
         if batch.row is None:
             return self._configured_rows(batch)
@@ -103,7 +106,7 @@ class RangeView:
         return torch.where(is_unknown, self._configured_rows(batch, is_unknown), batch.row)
 
     def _configured_rows(self, batch: PointBatch, which: Tensor | None = None) -> Tensor:
-        """Return the (P,) rows as the configuration says.
+        """Return the rows (P,) that `RangeViewConfig.rows` asks for.
 
         Args:
             which: (P,) bool: the points whose rows are needed; by default all.
@@ -139,7 +142,7 @@ class RangeView:
         return height - 1 - ring  # ring 0 is the lowest laser
 
     def _have_lasers(self, ring: Tensor, batch: PointBatch) -> Tensor:
-        """Return (B,) bool: the scans whose rings are those of a sensor with a laser a row."""
+        """Return (B,) bool: the scans of a sensor that has one laser for each row of the image."""
         highest = ring.new_full((batch.count,), -1).scatter_reduce_(0, batch.scan, ring, "amax")
         return self.config.has_laser_per_row(highest)
 
@@ -149,13 +152,13 @@ def _range_of(values: Tensor, which: Tensor | None = None) -> tuple[int, int]:
     chosen = values if which is None else values[which]
     if not len(chosen):
         return 0, 0
-    # Both at once, so that the CPU waits for a GPU only once.
+    # Copied together, so that the CPU waits for a GPU only once.
     lowest, highest = torch.stack(chosen.aminmax()).tolist()
     return lowest, highest
 
 
 def _cells(fractions: Tensor, cells: int) -> Tensor:
-    """Divide [0, 1] into equal cells, and return the cell of each number, (P,) int64.
+    """Divide [0, 1] into equal cells, and return each number's cell, (P,) int64.
 
     Numbers outside [0, 1] go to the nearest cell.
     """
@@ -165,10 +168,14 @@ def _cells(fractions: Tensor, cells: int) -> Tensor:
 def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tensor:
     """Return the (pixels,) int32 index of the nearest point in each pixel, -1 if it has none.
 
-    The points have a distance and a pixel, (P,); those nearer than `least` metres do not count.
+    Args:
+        distance: (P,) metres.
+        pixel: (P,) the pixel of each point.
+        pixels: the number of pixels.
+        least: metres; nearer points do not count.
     """
-    # The bits of floats >= 0 sort as the floats do, so one integer minimum finds both the least
-    # distance and its point.
+    # The bits of floats >= 0 sort as the floats do. So the minimum of integers that hold a distance
+    # above an index gives both the least distance and its point.
     index = torch.arange(len(distance), device=distance.device)
     key = index.add(distance.float().view(torch.int32), alpha=1 << _INDEX_BITS)
 
