@@ -216,6 +216,16 @@ def without_intensity(folder: Path) -> Case:
     return Case(write_bin(folder / "constant.bin", points))
 
 
+def with_odd_intensities(folder: Path) -> Case:
+    points, laser = place(HDL64E, 1.73)
+    points = by_laser(points, laser)
+    points[::30, :3] = 0
+    points[::30, 3] = -1  # of lost returns
+    points[1::400, 3] = -1
+    points[2::400, 3] = np.inf
+    return Case(write_bin(folder / "odd.bin", points))
+
+
 def bright(folder: Path) -> Case:
     points, _ = place(HDL64E, 1.73)
     points[:, 3] = np.round(points[:, 3] ** 4 * 60_000)
@@ -238,6 +248,7 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     on_a_mound,
     without_a_ground,
     without_intensity,
+    with_odd_intensities,
     bright,
 )
 

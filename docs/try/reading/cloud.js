@@ -71,3 +71,15 @@ export function ringIndices(values) {
   }
   return low < high && high < MOST_RINGS ? ring : null;
 }
+
+/** Return whether the point at xyz[start] has finite coordinates and is not at 0, 0, 0, as lost returns are. */
+export function isPlaced(xyz, start) {
+  const [x, y, z] = [xyz[start], xyz[start + 1], xyz[start + 2]];
+  return Number.isFinite(x) && Number.isFinite(y) && Number.isFinite(z) && (x !== 0 || y !== 0 || z !== 0);
+}
+
+/** Return the finite intensities of the points with a place, ascending: what lost returns have says nothing. */
+export function measuredIntensities({ xyz, intensity }) {
+  if (!intensity) return new Float64Array(0);
+  return Float64Array.from(intensity.values).filter((value, i) => Number.isFinite(value) && isPlaced(xyz, 3 * i)).sort();
+}

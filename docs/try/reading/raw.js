@@ -12,6 +12,7 @@ const ADVICE = "save it as a .pcd or .ply file, or label it with amvnet predict 
 // What tells coordinates and intensities from other columns, and float32 from other types.
 const LARGEST_INTENSITY = 65535;  // of any device
 const NEAR = 500;  // metres: coordinates of usual scans are smaller
+const NO_INTENSITY = -1;  // as some tools write for a lost return; no other intensity is negative
 const USUAL = 0.999;  // share of the points that must have such values; the others may be outliers
 
 // What tells ring indices from labels: lasers have about as many points as each other, or each has one elevation.
@@ -55,7 +56,7 @@ function columnsOf(bytes, width) {
 
 /** Return whether columns can be x, y, z, intensity and ring; if not `isNamed`, they must not look like labels. */
 function isNuscenes([x, y, z, intensity, values], isNamed) {
-  if (!values.every(Number.isInteger) || !intensity.every((value) => value >= 0)) return false;
+  if (!values.every(Number.isInteger) || !intensity.every(isIntensity)) return false;
   const ring = ringIndices(values), isFraction = [x, y, z].some((axis) => !axis.every(Number.isInteger));
   return ring !== null && isFraction && (isNamed || areRings(x, y, z, ring));
 }
@@ -78,14 +79,18 @@ function areRings(x, y, z, ring) {
   return within <= SPREAD * (total(squares) - total(sums) ** 2 / ring.length);
 }
 
-/** Return whether columns can be x, y, z and intensity, which is never negative. Lost points may be NaN. */
+/** Return whether columns can be x, y, z and intensity. Some coordinates are negative; those of lost points not finite. */
 function isKitti([x, y, z, intensity]) {
   const isNear = (i) => Math.abs(x[i]) < NEAR && Math.abs(y[i]) < NEAR && Math.abs(z[i]) < NEAR;
-  const isIntensity = (value) => Number.isNaN(value) || (value >= 0 && value <= LARGEST_INTENSITY);
   let usual = 0;
   for (let i = 0; i < x.length; i++) {
-    const isLost = Number.isNaN(x[i] + y[i] + z[i]);
+    const isLost = !(Number.isFinite(x[i]) && Number.isFinite(y[i]) && Number.isFinite(z[i]));
     if ((isLost || isNear(i)) && isIntensity(intensity[i])) usual++;
   }
   return [x, y, z].some((axis) => axis.some((value) => value < 0)) && usual >= USUAL * x.length;
+}
+
+/** Return whether a value can be an intensity, also of a lost point. */
+function isIntensity(value) {
+  return (value >= 0 && value <= LARGEST_INTENSITY) || value === NO_INTENSITY || !Number.isFinite(value);
 }

@@ -1,6 +1,8 @@
 // Brings intensities to the range and the distribution that the weights know. All decisions rest on quantiles, so
 // that a few outliers change nothing.
 
+import { counted } from "../errors.js";
+import { measuredIntensities } from "../reading/cloud.js";
 import { drawing, interpolate, quantilesOf } from "./statistics.js";
 
 // The quantiles at these probabilities describe a distribution of intensities.
@@ -9,12 +11,6 @@ const MEDIAN = PROBABILITIES.indexOf(0.5), BRIGHT = PROBABILITIES.indexOf(0.9);
 const DARKEST = 0.004;  // one step of 8 bits: below it, factors mean nothing
 const ALIKE = 2;  // factor by which the median or the bright quantile of two distributions that are alike may differ
 const CONSTANT = 0.01;  // share of the median: if 98 % of the intensities differ by less, they say nothing
-
-/** Return the quantiles of intensities; null if there are none. */
-function distributionOf(values) {
-  const finite = Float64Array.from(values).filter(Number.isFinite).sort();
-  return finite.length ? quantilesOf(finite, PROBABILITIES) : null;
-}
 
 /** Return whether nearly all intensities are the same, so that they say nothing. */
 function isConstant(quantiles) {
@@ -38,9 +34,9 @@ function matching(quantiles, trained) {
  * `trained` says what the weights know: {quantiles, is_optional, is_matched}, or null.
  */
 export function intensityMap(cloud, trained) {
-  const { intensity, count } = cloud, quantiles = intensity && distributionOf(intensity.values);
-  const fill = () => filler(count, trained);
-  if (!quantiles) return { text: `no intensity (${fillerText(trained)})`, apply: fill };
+  const { intensity, count } = cloud, measured = measuredIntensities(cloud);
+  const quantiles = quantilesOf(measured, PROBABILITIES), fill = () => filler(count, trained);
+  if (!measured.length) return { text: `no intensity (${fillerText(trained)})`, apply: fill };
   if (isConstant(quantiles)) {
     const level = Number(quantiles[MEDIAN].toPrecision(6));
     return { text: `intensity ${level} everywhere, so none (${fillerText(trained)})`, apply: fill };
@@ -48,7 +44,7 @@ export function intensityMap(cloud, trained) {
 
   const scale = usualScale(quantiles.at(-1), intensity.isInteger), { values } = intensity;
   const rounded = values instanceof Float32Array ? Math.fround : (value) => value;
-  const divided = (value) => Math.min(Math.max(rounded(value / scale), 0), 1);
+  const divided = (value) => (Number.isFinite(value) ? Math.min(Math.max(rounded(value / scale), 0), 1) : NaN);
   const linear = { text: `intensity 0 to ${Number(scale.toPrecision(6))}`, apply: () => Float32Array.from(values, divided) };
   if (trained?.is_matched) return { ...linear, text: `${linear.text}, spread as in the training` };  // by matchScan
   if (!trained || areAlike(quantiles.map((value) => value / scale), trained.quantiles)) return linear;
@@ -56,16 +52,25 @@ export function intensityMap(cloud, trained) {
   const matched = matching(quantiles, trained.quantiles);
   const [half, now] = [quantiles[MEDIAN] / scale, trained.quantiles[MEDIAN]].map((value) => Number(value.toPrecision(2)));
   return {
-    text: `${linear.text}, spread as in the training: half of it was below ${half}, now ${now}`,
+    text: `${linear.text}, spread as in the training: half of it was below ${half}, now ${now} ` +
+      `(--intensity-scale ${Number(scale.toPrecision(6))} keeps it)`,
     apply: () => Float32Array.from(values, (value) => (Number.isFinite(value) ? matched(value) : NaN)),
   };
+}
+
+/** Say how many points have an intensity below 0, which counts as 0; empty if none has, or all have. */
+export function negativeText(cloud) {
+  const measured = measuredIntensities(cloud), below = measured.findIndex((value) => value >= 0);
+  if (below <= 0) return "";
+  const lowest = Number(measured[0].toPrecision(6));
+  return `intensity ${lowest} in ${counted(below)} of ${counted(measured.length)} points (0 instead)`;
 }
 
 /** Bring the intensities of points (4 n), in place, to the distribution of the training, if this asks for it. */
 export function matchIntensity(points, trained) {
   if (!trained?.is_matched) return;
-  const quantiles = distributionOf(points.filter((_, place) => place % 4 === 3));
-  if (!quantiles || isConstant(quantiles)) return;
+  const quantiles = quantilesOf(points.filter((_, place) => place % 4 === 3).sort(), PROBABILITIES);
+  if (isConstant(quantiles)) return;
   const matched = matching(quantiles, trained.quantiles);
   for (let i = 3; i < points.length; i += 4) points[i] = matched(points[i]);
 }

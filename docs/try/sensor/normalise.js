@@ -1,9 +1,10 @@
 // Normalises a scan of any sensor to what the weights expect: axes, height, intensities, rows.
 
 import { InputError } from "../errors.js";
+import { isPlaced } from "../reading/cloud.js";
 import { findFrame, isOnGround, risesOf, toLevel } from "./frame.js";
 import { NEAREST } from "./ground.js";
-import { intensityMap, matchIntensity } from "./intensity.js";
+import { intensityMap, matchIntensity, negativeText } from "./intensity.js";
 import { elevationOf, hasEndsOf, rowsOf } from "./rows.js";
 import { quantilesOf } from "./statistics.js";
 
@@ -19,8 +20,7 @@ const SAME_BEAMS = 1.4;  // factor: numbers of lasers are alike if they differ b
  */
 export function normalise(cloud, expected) {
   const { name, xyz, count } = cloud, { sensor } = expected;
-  const isUsable = (i) => [0, 1, 2].every((axis) => Number.isFinite(xyz[i + axis])) && (xyz[i] || xyz[i + 1] || xyz[i + 2]);
-  const usable = xyz.filter((_, place) => isUsable(place - (place % 3)));
+  const usable = xyz.filter((_, place) => isPlaced(xyz, place - (place % 3)));
   const frame = findFrame(usable, name);
   const [toSensor, toTrained] = risesOf(frame, sensor.height);
 
@@ -31,8 +31,9 @@ export function normalise(cloud, expected) {
 
   const moved = raised(points, toTrained);
   matchIntensity(moved, expected.intensity);
-  const assumed = [map.text, ...frameTexts(frame), heightText(frame, sensor.height), lasersText(lasers)];
-  return { count, points: moved, rows, places, text: `assumed ${assumed.join(", ")}${sensorText(lasers, sensor)}` };
+  const texts = [map.text, negativeText(cloud), ...frameTexts(frame), heightText(frame, sensor.height), lasersText(lasers)];
+  const text = `assumed ${texts.filter(Boolean).join(", ")}${sensorText(lasers, sensor)}`;
+  return { count, points: moved, rows, places, text };
 }
 
 /** Return {points, places}: the points (4 n, float32) that are finite and not at the origin, and where they were. */
