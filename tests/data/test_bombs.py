@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
 import pytest
 import yaml
 from backports import zstd
@@ -93,6 +94,33 @@ def columns_bomb(path: Path) -> None:
 def records_bomb(path: Path) -> None:
     padded = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("", "|V100000000")]
     write_npz(path, padded, (40,), 4000)
+
+
+def gzip_bomb(path: Path) -> None:
+    end = struct.pack("<II", 0, (4000 << 20) % (1 << 32))
+    path.write_bytes(b"\x1f\x8b\x08\0\0\0\0\0\0\xff" + deflated(4000) + end)
+
+
+def archive_bomb(path: Path) -> None:
+    path.write_bytes(zipped("a.bin", b"", 4000))
+
+
+def archive_of_many_names(path: Path) -> None:
+    """Write 250,000 entries; the one end counts only some of them."""
+    entry = (
+        b"PK\1\2" + struct.pack("<HHHHHHIIIHHHHHII", *(20, 20), *[0] * 7, 5, *[0] * 6) + b"a.bin"
+    )
+    entries = entry * 250_000
+    end = struct.pack("<HHHHIIH", 0, 0, 9, 9, len(entries), 0, 0)
+    path.write_bytes(entries + b"PK\5\6" + end)
+
+
+def sweep_of_zeros(path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    feather = pytest.importorskip("pyarrow.feather")
+    column = pyarrow.array(np.zeros(60_000_000, np.float32))
+    table = pyarrow.table([column, column, column], names=["x", "y", "z"])
+    feather.write_feather(table, path, compression="zstd", chunksize=60_000_000)
 
 
 # --- PCD ---
@@ -283,6 +311,10 @@ BOMBS: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "metadata": ("scan", metadata_of_merges, "metadata"),
     "schema.db3": ("scan", endless_schema, "takes too long"),
     "definitions.db3": ("scan", endless_definitions, "definitions.db3"),
+    "bomb.bin.gz": ("scan", gzip_bomb, "bomb.bin.gz"),
+    "bomb.zip": ("scan", archive_bomb, "bomb.zip (a.bin)"),
+    "many.zip": ("scan", archive_of_many_names, "250,000"),
+    "zeros.feather": ("scan", sweep_of_zeros, "zeros.feather"),
     "many.las": ("scan", laz_of_many_points, "many.las"),
     "long.xyz": ("scan", long_text, ""),
     "number.xyz": ("scan", long_number, ""),

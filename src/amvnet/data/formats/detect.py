@@ -12,13 +12,16 @@ from amvnet.errors import InputError
 TEXT = (".xyz", ".txt", ".csv", ".asc", ".pts")
 BAGS = (".bag", ".mcap", ".db3")
 FOLDER = ""  # instead of an ending: the folder of a ROS 2 bag
+ARCHIVE = ".zip"  # of scan files
+GZIP = ".gz"  # after the ending of a scan file
 METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
 # The endings of all files that are read; docs/own_scans.md says what is read of each kind.
 ENDINGS = (
     *(NUSCENES_ENDING, ".bin", ".pcd", ".ply", ".npy", ".npz"),
     *TEXT,
-    *(".las", ".laz"),
+    *(".las", ".laz", ".feather"),
     *BAGS,
+    ARCHIVE,
 )
 
 # The first bytes of files.
@@ -33,6 +36,8 @@ BEGINNINGS = {
     b"#ROSBAG": ".bag",
     b"\x89MCAP0\r\n": ".mcap",
     b"SQLite format 3\x00": ".db3",
+    b"ARROW1": ".feather",
+    b"\x1f\x8b": GZIP,
 }
 BEGINNING = 4096  # bytes in which one of them must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
@@ -58,10 +63,12 @@ def ending_of(path: Path) -> str:
         ) from None
 
     ending = _begins_as(head[:BEGINNING])
-    if ending is not None:
-        return ending
-
     named = named_ending(path)
+    if ending is not None:
+        # Archives of NumPy begin as all others: only the name tells.
+        is_archive = ending == ".npz" and named == ARCHIVE
+        return ARCHIVE if is_archive else ending
+
     if find_table(head) is not None:
         return named if named in TEXT else TEXT[0]
 
@@ -85,9 +92,16 @@ def _begins_as(beginning: bytes) -> str | None:
 
 
 def named_ending(path: Path) -> str | None:
-    """Return the known ending of a file's name; None if it has none."""
+    """Return the known ending of a file's name; None if it has none.
+
+    It is `.gz` if the rest of the name is that of a file of one scan.
+    """
+    name = path.name.lower()
+    if name.endswith(GZIP):
+        packed = named_ending(Path(name.removesuffix(GZIP)))
+        return None if packed in (None, GZIP, ARCHIVE, *BAGS, *TEXT) else GZIP
     for ending in ENDINGS:
-        if path.name.lower().endswith(ending):
+        if name.endswith(ending):
             return ending
     return None
 

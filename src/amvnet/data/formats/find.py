@@ -11,16 +11,18 @@ from pathlib import Path
 
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import (
+    ARCHIVE,
     BAGS,
     ENDINGS,
     FOLDER,
+    GZIP,
     METADATA,
     TEXT,
     ending_of,
     is_dead_link,
     named_ending,
 )
-from amvnet.data.formats.registry import open_bag, read_file
+from amvnet.data.formats.registry import list_archive, open_bag, read_file, read_from_archive
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
@@ -128,15 +130,38 @@ def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
 def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> list[NamedScan]:
     """Return the scans of a file or a bag."""
     ending = ending_of(file)
+    if ending == ARCHIVE:
+        return _scans_of_archive(file, name, layout)
     if ending not in (FOLDER, *BAGS):
-        source = str(file.parent / f"*{ending}")
         read = partial(read_file, file, ending, layout)
+        source = str(file.parent / f"*{ending}")
+        if ending == GZIP:
+            ending = named_ending(Path(file.name.lower().removesuffix(GZIP))) or ""
+            source = str(file.parent / f"*{ending}{GZIP}")
         return [NamedScan(name, source, path=file, ending=ending, read=read)]
 
     scans = []
     for index, read_one in enumerate(open_bag(file, ending, topic)):
         name_in_bag = f"{name}/{index:06d}"
         scans.append(NamedScan(name_in_bag, str(file), path=file, ending=ending, read=read_one))
+    return scans
+
+
+def _scans_of_archive(file: Path, name: str, layout: RowLayout) -> list[NamedScan]:
+    """Return the scans of an archive; the files of each of its folders are a recording."""
+    scans = []
+    for member in list_archive(file):
+        place = Path(member)
+        ending = named_ending(place) or ""
+        scans.append(
+            NamedScan(
+                f"{name}/{member[: len(member) - len(ending)]}",
+                source=str(file / place.parent / f"*{ending}"),
+                path=file,
+                ending=ending,
+                read=partial(read_from_archive, file, member, layout),
+            )
+        )
     return scans
 
 
@@ -211,4 +236,5 @@ def scan_stem(path: Path) -> str:
     if path.is_dir():
         return name
     ending = named_ending(Path(name)) or path.suffix
-    return name[: len(name) - len(ending)]
+    stem = name[: len(name) - len(ending)]
+    return scan_stem(path.with_name(stem)) if ending == GZIP else stem

@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from amvnet.data.formats import las, numpy_files, pcd, ply, text
+from amvnet.data.formats import feather, las, numpy_files, packed, pcd, ply, text
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.cloud import COLUMN_NAMES, Arrays, Cloud, Names, make_cloud
-from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, TEXT
+from amvnet.data.formats.detect import ARCHIVE, BAGS, FOLDER, GZIP, NUSCENES_ENDING, TEXT
 from amvnet.data.formats.raw import read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
 from amvnet.errors import InputError, readable
 
+EXTRAS = {"pyarrow": "feather"}  # that install the packages; the others are in `formats`
 OPEN_BAGS = 4  # that the process with limits keeps open
 
 # By the endings of files: readers that need to know what rows without names hold, and readers of
@@ -36,11 +37,14 @@ COLUMN_READERS: dict[str, Callable[[Path, Names], Arrays]] = {
     ".ply": ply.read_columns,
     ".las": las.read_columns,
     ".laz": las.read_columns,
+    ".feather": feather.read_columns,
     **dict.fromkeys(TEXT, text.read_columns),
 }
 
-# Packages of the extra `formats`. Files that need them are read in the process with limits.
-PACKAGES = {
+# The files that are read in the process with limits, and the packages that they need.
+PACKAGES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys((GZIP, ARCHIVE), ()),
+    ".feather": ("pyarrow",),
     **dict.fromkeys((".las", ".laz"), ("laspy", "lazrs")),
     **dict.fromkeys((FOLDER, *BAGS), ("rosbags",)),
 }
@@ -57,6 +61,10 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
         InputError: if the file is broken, or needs a package that is missing.
     """
     with readable(path):
+        if ending == GZIP:
+            return Cloud(**_call(read_gzip, path, ending, *_to_json(layout)))
+        if ending == ARCHIVE:
+            raise InputError(f"{path}: expected a file of one scan, found an archive; unpack it")
         if ending in ROW_READERS:
             return ROW_READERS[ending](path, layout)
         return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
@@ -73,6 +81,21 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     """
     columns: Arrays = _call(COLUMN_READERS[ending], path, ending, wanted)
     return columns
+
+
+def list_archive(path: Path) -> list[str]:
+    """Return the names of the scans in an archive; raise InputError if there is none."""
+    names: list[str] = _call(list_members, path, ARCHIVE)["names"]
+    return names
+
+
+def read_from_archive(path: Path, name: str, layout: RowLayout) -> Cloud:
+    """Read a scan of an archive by its name; raise InputError if it is broken."""
+    return Cloud(**_call(read_member, path, ARCHIVE, name, *_to_json(layout)))
+
+
+def _to_json(layout: RowLayout) -> tuple[list[str], list[str]]:
+    return list(layout.columns), list(layout.dtypes)
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
@@ -104,7 +127,7 @@ def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any
     if missing:
         raise InputError(
             f"{path}: expected the package {' and '.join(missing)}, found none; "
-            'run pip install "amvnet[formats]"'
+            f'run pip install "amvnet[{EXTRAS.get(missing[0], "formats")}]"'
         )
     with readable(path):
         return call(function, path, *arguments)
@@ -127,3 +150,23 @@ def read_from_bag(path: Path, index: int, *bag: Any) -> dict[str, Any]:
 def _open(path: Path, ending: str, topic: str | None, _opening: str) -> Bag:
     """Open a bag, once for each `_opening` by `open_bag`: the file may have changed in between."""
     return Bag(path, ending, topic)
+
+
+def read_gzip(path: Path, columns: list[str], dtypes: list[str]) -> dict[str, Any]:
+    """Return the attributes of the cloud in a file that is packed by gzip."""
+    return vars(packed.read_gzip(path, _reader(columns, dtypes)))
+
+
+def list_members(path: Path) -> dict[str, list[str]]:
+    """Return the names of the scans in an archive."""
+    return {"names": packed.member_names(path)}
+
+
+def read_member(path: Path, name: str, columns: list[str], dtypes: list[str]) -> dict[str, Any]:
+    """Return the attributes of a cloud in an archive."""
+    return vars(packed.read_member(path, name, _reader(columns, dtypes)))
+
+
+def _reader(columns: list[str], dtypes: list[str]) -> Callable[[Path, str], Cloud]:
+    layout = RowLayout(tuple(columns), tuple(dtypes))
+    return partial(read_file, layout=layout)
