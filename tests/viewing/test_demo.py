@@ -61,7 +61,7 @@ def test_weights_of_the_other_sensor_get_its_streets_and_each_seed_its_own(tmp_p
     pytest.importorskip("embreex")
     pages = []
     for seed in (1, 2):
-        assert run_demo(tmp_path, fresh_weights(NUSCENES), "--seed", seed) == (0, "")
+        assert run_demo(tmp_path, fresh_weights(NUSCENES), "--seed", seed, "--overwrite") == (0, "")
         pages.append(read_page(tmp_path / "demo/index.html"))
 
     for page in pages:
