@@ -1,4 +1,4 @@
-"""Writes simulated scans in the layouts of SemanticKITTI and nuScenes-lidarseg."""
+"""Writes simulated scans in the layouts of SemanticKITTI and nuScenes-lidarseg, and of a robot."""
 
 import hashlib
 import json
@@ -32,6 +32,40 @@ VERSION = "v1.0-trainval"
 # Microseconds: time of the first scan of scene 0, and between the first scans of two scenes.
 START = 1_600_000_000_000_000
 SCENE_STEP = 1_000_000_000
+
+# The ids of a robot's labels, by the class of a street; all other points have no class.
+_NO_CLASS = -1
+_ROBOT_IDS: dict[Label, int] = {
+    **dict.fromkeys(
+        [
+            Label.ROAD,
+            Label.PARKING,
+            Label.SIDEWALK,
+            Label.OTHER_GROUND,
+            Label.TERRAIN,
+            Label.LANE_MARKING,
+        ],
+        3,
+    ),
+    **dict.fromkeys([Label.VEGETATION, Label.TRUNK], 7),
+    **dict.fromkeys([Label.BUILDING, Label.FENCE], 21),
+    **dict.fromkeys([Label.POLE, Label.TRAFFIC_SIGN], 22),
+    **dict.fromkeys(
+        [Label.CAR, Label.TRUCK, Label.OTHER_VEHICLE, Label.BICYCLE, Label.MOTORCYCLE], 40
+    ),
+    **dict.fromkeys([Label.PERSON, Label.BICYCLIST, Label.MOTORCYCLIST], 9),
+}
+_ROBOT_YAML = """\
+classes:
+  ground: 3
+  plant: {ids: 7, color: [0, 175, 0]}
+  structure: [21, 22]
+  vehicle: {ids: [40]}
+  person: 9
+ignored: [-1]
+scans: "*/clouds/*.pcd"
+labels: "../truth/{name}.npy"
+"""
 
 WRITING = threading.Lock()  # held while a file is written
 
@@ -179,10 +213,59 @@ class NuScenesLayout:
             write_whole(out / VERSION / f"{name}.json", json.dumps(rows, indent=0).encode())
 
 
-LAYOUTS: Mapping[str, type[SemanticKittiLayout] | type[NuScenesLayout]] = {
+@dataclass
+class RobotLayout:
+    """OUT/site_a/clouds/0000.pcd and OUT/site_a/truth/0000.npy, in a layout of no benchmark.
+
+    OUT/robot.yaml describes them: five classes with ids of their own.
+    """
+
+    out: Path
+    number: int
+
+    @property
+    def folder(self) -> Path:
+        return self.out / _site(self.number)
+
+    def write_scan(self, index: int, scan: SimulatedScan) -> None:
+        """Write one scan as a binary PCD file, and its labels as a NumPy file."""
+        count = len(scan.points)
+        header = (
+            "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+            f"WIDTH {count}\nHEIGHT 1\nPOINTS {count}\nDATA binary\n"
+        )
+        content = header.encode() + scan.points.astype("<f4").tobytes()
+        write_whole(self.folder / "clouds" / f"{index:04d}.pcd", content)
+
+        table = np.full(2**16, _NO_CLASS, dtype=np.int16)
+        for label, robot_id in _ROBOT_IDS.items():
+            table[[label.raw, MOVING.get(label, label.raw)]] = robot_id
+        labels = BytesIO()
+        np.save(labels, table[scan.semantickitti_ids() & CLASS_MASK])
+        write_whole(self.folder / "truth" / f"{index:04d}.npy", labels.getvalue())
+
+    def finish(self) -> Row:
+        """Return the name of the site."""
+        return {"site": _site(self.number)}
+
+    @staticmethod
+    def complete(out: Path, sequences: list[Row]) -> None:
+        """Write robot.yaml; the last of several sites validates."""
+        *train, val = [sequence["site"] for sequence in sequences]
+        split = f"split:\n  train: [{', '.join(train)}]\n  val: {val}\n" if train else ""
+        write_whole(out / "robot.yaml", (_ROBOT_YAML + split).encode())
+
+
+LAYOUTS: Mapping[str, type[SemanticKittiLayout] | type[NuScenesLayout] | type[RobotLayout]] = {
     "semantickitti": SemanticKittiLayout,
     "nuscenes": NuScenesLayout,
+    "robot": RobotLayout,
 }
+
+
+def _site(number: int) -> str:
+    """Return "site_a" for 0, "site_z" for 25, "site_26" for 26."""
+    return f"site_{chr(ord('a') + number) if number < 26 else number}"
 
 
 def _add(tables: Tables, table: str, token: str, **columns: Any) -> None:

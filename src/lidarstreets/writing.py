@@ -71,8 +71,8 @@ def simulate(
     has completed are kept.
 
     Args:
-        out: folder to write to, in the layout of SemanticKITTI (HDL-64E) or nuScenes-lidarseg
-            (HDL-32E).
+        out: folder to write to, in the layout of SemanticKITTI (HDL-64E), nuScenes-lidarseg
+            (HDL-32E) or a robot with a YAML file (VLP-16).
         sensor: name of a sensor in `SENSORS`.
         sequences: number of sequences; each is another street.
         scans: number of scans in each sequence.

@@ -21,7 +21,7 @@ from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.laser_order import with_lasers
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.training.loaders import ScanSet, make_loader
-from lidarstreets import SENSORS, SimulatedScan, simulate
+from lidarstreets import SimulatedScan, simulate
 
 from fixtures.worlds import fails, fake_drive
 
@@ -29,7 +29,7 @@ BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
 REAL_DRIVE = simulated.drive_street
 
 
-@pytest.fixture(params=SENSORS)
+@pytest.fixture(params=simulated.SENSORS)
 def sensor(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name

@@ -26,7 +26,8 @@ def simulate(
 
     Args:
         out: folder to write to.
-        sensor: the LiDAR: hdl64e writes SemanticKITTI's layout, hdl32e that of nuScenes-lidarseg.
+        sensor: the LiDAR: hdl64e writes SemanticKITTI's layout, hdl32e that of nuScenes-lidarseg,
+            vlp16 (on a robot) a layout of its own, which robot.yaml in the folder describes.
         sequences: number of sequences; each is another street.
         scans: number of scans in each sequence.
         seed: of all randomness; the same seed gives the same bytes.
