@@ -37,7 +37,7 @@ def test_changes_have_both_values_but_no_digests() -> None:
         "model.range_net.widths [8, 32] instead of [8, 16]",
         "training.rv.lr 0.001 instead of 0.003",
         "training.rv.ema 0.9 instead of None",
-        "another scans.train",
+        "other scans to train on",
     ]
 
 

@@ -31,6 +31,11 @@ RECORD = "run.yaml"  # in the folder of a run: what each call read
 RECIPE = "recipe.yaml"
 WEIGHTS = "weights.safetensors"
 COUNTS = "class_counts.npz"  # points of each class
+# Settings whose digests say nothing to people, in words.
+SCANS_CHANGED = {
+    "scans.train": "other scans to train on",
+    "scans.val": "other scans to validate with",
+}
 MOST_CHANGES = 6  # settings that a message names
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")
 
@@ -164,15 +169,15 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         more = f" and {others} more" if others > 0 else ""
         raise InputError(
             f"{folder}: expected the settings of the earlier run ({SETTINGS}), found "
-            f"{', '.join(changes[:MOST_CHANGES])}{more}; resume it with those, or give another "
-            "folder"
+            f"{', '.join(changes[:MOST_CHANGES])}{more}; resume it with those, or train further "
+            f"from its weights in another folder: --init {folder.parent} --out FOLDER"
         )
 
 
 def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[str]:
     """Return what differs between the settings of a stage, as "training.rv.lr 0.1 instead of 0.2".
 
-    Digests, which say nothing to people, are not shown: "another scans.train".
+    Digests, which say nothing to people, are not shown: "other scans to train on".
     """
     before = dict(_flat(earlier))
     now = dict(_flat(settings))
@@ -182,6 +187,8 @@ def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[
             continue
         if name.startswith(("model.", "training.")):
             changes.append(f"{name} {now.get(name)} instead of {before.get(name)}")
+        elif name in SCANS_CHANGED:
+            changes.append(SCANS_CHANGED[name])
         else:
             changes.append(f"another {name}")
     return changes

@@ -43,6 +43,7 @@ def train(
             nothing is validated.
     """
     from amvnet.data.datasets.joined import join
+    from amvnet.models.methods import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
     from amvnet.training.plan import Plan, open_parts, sized_by_init, without_mean
     from amvnet.training.run import train as train_stages
@@ -67,4 +68,9 @@ def train(
         scores=models.parse(),
         also_read=(*data, init),
     )
-    say(f"weights in {train_stages(plan, stage, weights)}")
+    path = train_stages(plan, stage, weights)
+    line = f"weights in {path}"
+    parts = load(path).parts
+    if stage != "head" and set(BOTH_NETWORKS) <= set(parts) and "point_head" not in parts:
+        line += "; they have no point head: the same command with --stage head trains it"
+    say(line)
