@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ import pytest
 
 import amvnet
 from amvnet.cli.main import VERBS, main
+from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.sensors.lidars import SENSORS
 from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
-from amvnet.weights.file import save
+from amvnet.weights.file import built_in, save
 
 from fixtures.worlds import (
     GOLDEN,
@@ -421,3 +424,17 @@ def test_benchs_figures_add_up(world: Path, tmp_path: Path) -> None:
     total = sum(medians.values())
     assert 0 < mean < total
     assert total == pytest.approx(figures["all_ms"]["median"], rel=0.5)
+
+
+def test_list_names_all_weights_recipes_and_sensors(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_cli("list") == (0, "")
+    text = capsys.readouterr().out
+    for name in (*built_in(), *recipe_names(), *SENSORS):
+        assert f" {name} " in text
+
+
+def test_info_has_no_dictionaries(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_cli("info", "sim-hdl64e") == (0, "")
+    text = capsys.readouterr().out
+    assert "{" not in text
+    assert re.search(r"(?m)^\| rv.epochs \| \d+ \|$", text)

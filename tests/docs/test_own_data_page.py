@@ -73,7 +73,8 @@ def test_every_command_of_the_page_runs(
     sensor = load("runs/new").training["range_net"]["sensor"]
     assert (sensor["fov_up"], sensor["fov_down"]) == pytest.approx((15, -15), abs=2)
     assert sensor["height"] == 1.73 != SENSORS["vlp16"].height
-    assert Path("next.csv").read_text().startswith("scan")
+    assert "site_d" in Path("next.csv").read_text()
+    assert Path("runs/new/curves.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_scores_are_of_the_users_classes(tmp_path: Path) -> None:

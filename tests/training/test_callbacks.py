@@ -7,10 +7,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 from torch import nn
 
-from amvnet.training.callbacks import AverageWeights, KeepWeights, SeedBatches
+from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
 from amvnet.weights.file import load
 
 from fixtures.worlds import fresh_weights
@@ -134,3 +135,19 @@ def test_each_batch_has_draws_of_its_own_which_a_resumed_run_repeats() -> None:
     draws = [draw(*place) for place in places]
     assert len(set(draws)) == len(places)
     assert [draw(*place) for place in places] == draws
+
+
+def test_a_line_has_percent_and_the_whole_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines: list[str] = []
+    times = iter([100.0, 110.0])
+    monkeypatch.setattr("amvnet.training.callbacks.time.monotonic", lambda: next(times))
+    callback = EpochLines(lines.append, "rv", later=6)
+    metrics = {"train/loss": 1.5, "val/miou": 0.1234, "val/miou_present": 0.4}
+    trainer: Any = SimpleNamespace(callback_metrics=metrics, max_epochs=5, current_epoch=2)
+    module: Any = None
+    callback.on_train_epoch_start(trainer, module)
+    callback.on_train_epoch_end(trainer, module)
+    assert lines == [
+        "rv epoch 3/5: loss 1.500, val mIoU 12.3% (classes present 40.0%); epoch in 0:00:10, "
+        "0:00:20 left, about 0:01:20 with the stages that follow"
+    ]

@@ -23,6 +23,7 @@ from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
@@ -30,6 +31,7 @@ from amvnet.training import loaders, networks
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.checking import check_data
+from amvnet.training.curves import Curves, draw_curves, read_curves
 from amvnet.training.head_points import PointGatherer
 from amvnet.training.networks import NetworkStage
 from amvnet.training.plan import Plan
@@ -131,6 +133,23 @@ def test_a_stage_writes_its_best_and_last_weights_and_its_curves(run: Path, stag
     assert {"best.safetensors", "last.safetensors"} <= names
     assert any(name.startswith("events.out.tfevents") for name in names)
     assert len(column(run, stage, "val/miou")) == (2 if stage == "head" else 3)
+
+
+@STAGES
+def test_the_picture_of_a_run_shows_what_it_logged(run: Path, stage: str) -> None:
+    epochs = 2 if stage == "head" else 3
+    curves = read_curves(run / stage, SEMANTICKITTI, epochs)
+    assert curves.miou == column(run, stage, "val/miou")
+    assert [value for _, value in curves.loss] == column(run, stage, "train/loss")
+    assert 0 < curves.loss[0][0] <= curves.loss[-1][0] <= epochs
+    metrics = load(run / stage / "last.safetensors").metrics[PART_OF[stage]]
+    assert sum(curves.iou.values()) / 19 == pytest.approx(metrics["val/miou"], abs=1e-5)
+    assert (run / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_names_of_classes_are_no_formulas(tmp_path: Path) -> None:
+    curves = Curves([(1.0, 0.5)], [0.5], {"$a_b$": 0.5, "$": 0.2})
+    assert draw_curves({"rv": curves}, tmp_path / "curves.png").is_file()
 
 
 @STAGES

@@ -19,6 +19,7 @@ from amvnet.cli.commands.export import export
 from amvnet.cli.commands.fleet import fleet
 from amvnet.cli.commands.fuse import fuse
 from amvnet.cli.commands.info import info
+from amvnet.cli.commands.list import list as list_names
 from amvnet.cli.commands.predict import predict
 from amvnet.cli.commands.rank import rank
 from amvnet.cli.commands.simulate import simulate
@@ -33,7 +34,7 @@ from amvnet.runtime.threads import wait_passively
 
 # In the order of the help.
 _FIRST = (demo, simulate, check, train, predict, fleet, evaluate, submit, fuse)
-_LAST = (rank, analyze, ablate, export, view, bench, info)
+_LAST = (rank, analyze, ablate, export, view, bench, list_names, info)
 VERBS = {run_verb.__name__: run_verb for run_verb in _FIRST + _LAST}
 RESUMED = ("train", "predict", "fleet")  # verbs with --resume
 GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done

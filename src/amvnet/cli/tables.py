@@ -11,14 +11,16 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from amvnet.config.recipes import recipe_names
+from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.check import Report
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.evaluation.metrics import OVERALL
 from amvnet.inference.timing import MEAN, STAGES
 from amvnet.models.methods import title_of
 from amvnet.progress import counted
-from amvnet.weights.file import built_in
+from amvnet.sensors.lidars import SENSORS
+from amvnet.weights.file import built_in, load
+from lidarstreets import SENSORS as SIMULATED_SENSORS
 
 
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
@@ -123,6 +125,63 @@ def timing_table(report: Mapping[str, Any]) -> Table:
 def _times(spread: Mapping[str, float]) -> tuple[str, str]:
     """Return the median and the range between the quartiles, in milliseconds."""
     return f"{spread['median']:.1f}", f"{spread['low']:.1f} to {spread['high']:.1f}"
+
+
+def weights_table() -> Table:
+    """Return the table of the built-in weights."""
+    table = Table(title="weights", show_edge=False)
+    table.add_column("--weights", no_wrap=True)
+    for name in ("sensor", "classes", "range image", "mIoU in %"):
+        table.add_column(name)
+    for name in built_in():
+        weights = load(name)
+        image = weights.model.range_view
+        miou = weights.metrics.get("point_head", {}).get("val/miou")
+        table.add_row(
+            name,
+            weights.sensor,
+            f"{weights.taxonomy.size} of {weights.taxonomy.name}",
+            f"{image.height} x {image.width}",
+            _percent(miou),
+        )
+    table.caption = "mIoU of AMVNet in the validation of its training"
+    return table
+
+
+def recipes_table() -> Table:
+    """Return the table of the built-in recipes."""
+    table = Table(title="recipes", show_edge=False)
+    table.add_column("amvnet train", no_wrap=True)
+    for name in ("classes", "epochs", "range image"):
+        table.add_column(name)
+    for name in recipe_names():
+        recipe = load_recipe(name)
+        epochs = []
+        for stage in recipe.stages:
+            epochs.append(f"{stage} {getattr(recipe.training, stage).epochs}")
+        image = recipe.model.range_view
+        table.add_row(
+            name,
+            "of --init" if recipe.from_init else recipe.taxonomy,
+            ", ".join(epochs),
+            "of --init" if recipe.from_init else f"{image.height} x {image.width}",
+        )
+    return table
+
+
+def sensors_table() -> Table:
+    """Return the table of the sensors that are known by name."""
+    table = Table(title="sensors", show_edge=False)
+    table.add_column("--sensor")
+    for name in ("lasers", "up to", "down to"):
+        table.add_column(name, justify="right")
+    for name, sensor in SENSORS.items():
+        table.add_row(
+            name, str(sensor.beams), f"{sensor.fov_up:+g} degrees", f"{sensor.fov_down:+g} degrees"
+        )
+    simulated = ", ".join(SIMULATED_SENSORS)
+    table.caption = f"amvnet simulate has the sensors {simulated}"
+    return table
 
 
 def installation_table() -> Table:

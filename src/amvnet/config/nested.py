@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
 
 T = TypeVar("T")
+DEEPEST = 20  # levels of dictionaries that are made flat
 
 
 def merge_trees(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -59,6 +60,19 @@ def to_dict(config: Any) -> dict[str, Any]:
             tree[key] = value
 
     return tree
+
+
+def flat(tree: Any, name: str = "", depth: int = DEEPEST) -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested dictionaries, each with its keys, joined by dots.
+
+    Args:
+        depth: levels below which a dictionary is a value.
+    """
+    if not isinstance(tree, Mapping) or not depth:
+        yield name, tree
+        return
+    for key, value in tree.items():
+        yield from flat(value, f"{name}.{key}".removeprefix("."), depth - 1)
 
 
 def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:

@@ -174,11 +174,17 @@ class SeedBatches(Callback):
 
 
 class EpochLines(Callback):
-    """Says one line per epoch; used if there is no terminal for a progress bar."""
+    """Says one line per epoch; used if there is no terminal for a progress bar.
 
-    def __init__(self, say: Say, name: str) -> None:
+    Args:
+        later: the epochs of the stages that follow; the whole time left assumes that each takes as
+            long as one of this stage.
+    """
+
+    def __init__(self, say: Say, name: str, later: int = 0) -> None:
         self.say = say
         self.name = name
+        self.later = later
         self._start = 0.0
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -190,12 +196,15 @@ class EpochLines(Callback):
         if "val/miou" in metrics:
             miou = metrics["val/miou"]
             miou_present = metrics["val/miou_present"]
-            results += f", val mIoU {miou:.4f} (classes present {miou_present:.4f})"
+            results += f", val mIoU {miou:.1%} (classes present {miou_present:.1%})"
 
         epochs = trainer.max_epochs or 0
         epoch = trainer.current_epoch + 1
         took = timedelta(seconds=round(time.monotonic() - self._start))
-        times = f"epoch in {took}, {(epochs - epoch) * took} left"
+        left = (epochs - epoch) * took
+        times = f"epoch in {took}, {left} left"
+        if self.later:
+            times += f", about {left + self.later * took} with the stages that follow"
         self.say(f"{self.name} epoch {epoch}/{epochs}: {results}; {times}")
 
 

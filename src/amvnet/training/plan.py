@@ -37,6 +37,7 @@ class Plan:
         scores: two other models' scores of the scans, to train the head on instead of on the
             networks'; None without other models.
         also_read: files besides the scans that the run reads; what names no file is left out.
+        stages: the stages of this call in order, for the whole time left; empty if unknown.
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, or the recipe is for
@@ -52,6 +53,7 @@ class Plan:
     processes: Processes = ALONE
     scores: ScorePair | None = None
     also_read: Sequence[Path | str | None] = ()
+    stages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         size = self.processes.size

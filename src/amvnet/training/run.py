@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -11,10 +12,12 @@ import lightning as L
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
 from amvnet.training.checking import check_data, keep_counts
+from amvnet.training.curves import draw_curves, read_curves
 from amvnet.training.head import train_head
 from amvnet.training.networks import train_network
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import (
+    CURVES,
     DONE,
     PART_OF,
     WEIGHTS,
@@ -44,6 +47,8 @@ def train(
         raise InputError(f"expected --stage head for scores of other models, found {stage}; add it")
 
     check_folder(plan)
+    plan = dataclasses.replace(plan, stages=tuple(names))
+
     # Check all stages before anything is written, and before hours are spent on the first.
     weights = _first_weights(plan, init, names)
     for name in names:
@@ -61,7 +66,22 @@ def train(
         if plan.processes.first:
             save(_with_finished(plan, weights), path)
         plan.processes.wait()
+    if plan.processes.first:
+        _draw_curves(plan)
     return path
+
+
+def _draw_curves(plan: Plan) -> None:
+    """Draw the curves of all finished stages of the folder."""
+    stages = {}
+    taxonomy = plan.scans.dataset.taxonomy
+    for name in PART_OF:
+        if is_finished(plan, name):
+            epochs = getattr(plan.recipe.training, name).epochs
+            stages[name] = read_curves(plan.out / name, taxonomy, epochs)
+    if stages:
+        path = draw_curves(stages, plan.out / CURVES)
+        plan.say(f"loss, mIoU by epoch and IoU by class: {path}")
 
 
 def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from amvnet.config.nested import to_dict
+from amvnet.config.nested import flat, to_dict
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.joined import Joined
 from amvnet.errors import InputError
@@ -30,6 +30,7 @@ SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun w
 RECORD = "run.yaml"  # in the folder of a run: what each call read
 RECIPE = "recipe.yaml"
 WEIGHTS = "weights.safetensors"
+CURVES = "curves.png"
 COUNTS = "class_counts.npz"  # points of each class
 # Settings whose digests say nothing to people, in words.
 SCANS_CHANGED = {
@@ -52,7 +53,7 @@ def check_folder(plan: Plan) -> None:
     Raises:
         InputError: if what the run would write is there without a run, or is an input.
     """
-    names = (RECIPE, WEIGHTS, COUNTS, RECORD, *PART_OF)
+    names = (RECIPE, WEIGHTS, COUNTS, CURVES, RECORD, *PART_OF)
     check_not_read([plan.out / name for name in names], plan.also_read)
     if is_run(plan.out):
         return
@@ -179,8 +180,8 @@ def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[
 
     Digests, which say nothing to people, are not shown: "other scans to train on".
     """
-    before = dict(_flat(earlier))
-    now = dict(_flat(settings))
+    before = dict(flat(earlier))
+    now = dict(flat(settings))
     changes = []
     for name in now | before:
         if now.get(name) == before.get(name):
@@ -192,15 +193,6 @@ def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[
         else:
             changes.append(f"another {name}")
     return changes
-
-
-def _flat(tree: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested dictionaries, each with its keys, joined by dots."""
-    if not isinstance(tree, dict):
-        yield name, tree
-        return
-    for key, value in tree.items():
-        yield from _flat(value, f"{name}.{key}".removeprefix("."))
 
 
 def sequence_names(records: Sequence[ScanRecord]) -> list[str]:

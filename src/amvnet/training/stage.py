@@ -35,7 +35,7 @@ from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
 from amvnet.training.plan import Plan
-from amvnet.training.run_folder import LAST
+from amvnet.training.run_folder import LAST, is_finished
 from amvnet.training.sync_batch_norm import synchronise_batch_norms
 from amvnet.weights.file import Weights
 
@@ -231,6 +231,7 @@ def _callbacks(stage: Stage, plan: Plan, keep_weights: KeepWeights) -> list[Call
     Weights are written before the checkpoint, which never claims more than has been written.
     """
     has_bar = plan.bars and plan.processes.first
+    lines = EpochLines(plan.say, stage.name, _epochs_after(stage, plan))
     callbacks: list[Callback] = [
         keep_weights,
         KeepSignals(),
@@ -242,12 +243,27 @@ def _callbacks(stage: Stage, plan: Plan, keep_weights: KeepWeights) -> list[Call
             save_on_train_epoch_end=True,
         ),
         LearningRateMonitor(),
-        RichProgressBar() if has_bar else EpochLines(plan.say, stage.name),
+        RichProgressBar() if has_bar else lines,
     ]
     config = stage.config
     if isinstance(config, NetworkTraining) and (config.ema or config.initial):
         callbacks.append(AverageWeights(config.ema, config.initial))
     return callbacks
+
+
+def _epochs_after(stage: Stage, plan: Plan) -> int:
+    """Return about how many epochs of this stage the later stages of the call take.
+
+    The head's epochs take no time; what takes it is scoring the scans, once or for each view.
+    """
+    if stage.name not in plan.stages:
+        return 0
+    epochs = 0
+    for name in plan.stages[plan.stages.index(stage.name) + 1 :]:
+        config = getattr(plan.recipe.training, name)
+        if not (plan.resume and is_finished(plan, name)):
+            epochs += max(config.views, 1) if isinstance(config, HeadTraining) else config.epochs
+    return epochs
 
 
 def precision_of(training: TrainingConfig) -> Precision:

@@ -6,9 +6,11 @@ It says what the weights are, how to use them, what they were trained on and how
 from __future__ import annotations
 
 import reprlib
+from itertools import islice
 
 import yaml
 
+from amvnet.config.nested import flat
 from amvnet.models.methods import widest_method
 from amvnet.weights.file import Weights
 
@@ -19,6 +21,8 @@ TITLES = {
 }
 # Columns of the table: key of the validation metric, and title.
 METRICS = {"val/miou": "mIoU", "val/miou_present": "mIoU, classes present", "val/acc": "accuracy"}
+MOST_SETTINGS = 100  # of a part's training
+LONGEST_CELL = 300  # characters
 OURS = "apache-2.0"  # licence of the built-in weights, and of the package
 NO_LICENCE = (
     "The file names no licence. Weights may be bound by the terms of the data that they were "
@@ -47,14 +51,20 @@ def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
         f"## Metrics\n\n{_metrics(weights)}",
     ]
     for part in weights.parts:
-        lines = [f"## Training: {part}\n"]
-        for key, value in weights.training.get(part, {}).items():
-            lines.append(f"- {key}: {abridged.repr(value)}")
+        lines = [f"## Training: {part}\n", "| Setting | Value |", "|---|---|"]
+        for key, value in islice(flat(weights.training.get(part, {}), depth=3), MOST_SETTINGS):
+            text = value if isinstance(value, str) else abridged.repr(value)
+            lines.append(f"| {_cell(key)} | {_cell(text)} |")
         sections.append("\n".join(lines))
 
     terms = NO_LICENCE if licence is None else f"{licence}, as the owner of the weights says."
     sections.append(f"## Licence\n\n{terms}")
     return "\n\n".join(sections) + "\n"
+
+
+def _cell(text: str) -> str:
+    """Return a text that fits the cell of a table: short, and without what would end the cell."""
+    return " ".join(text[:LONGEST_CELL].split()).replace("|", "\\|")
 
 
 def front_matter(weights: Weights, licence: str | None = None) -> str:

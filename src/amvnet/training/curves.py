@@ -1,0 +1,101 @@
+"""A picture of a training's curves: the loss, the mIoU by epoch and the IoU by class."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.files import atomic_write
+
+SIZE = (12.0, 3.6)  # inches, of the row of a stage
+DOTS_PER_INCH = 120
+FEW = 30  # points of a curve that are marked
+LOSS = "train/loss"
+MIOU = "val/miou"
+CLASS = "iou/"  # beginning of the names of the classes' metrics
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What a stage logged.
+
+    Attributes:
+        loss: at each logged step, the epoch (1.0 is the end of the first) and the loss.
+        miou: of the validation by epoch, in [0, 1].
+        iou: by class, in the order of the classes, at the last epoch; absent classes are left out.
+    """
+
+    loss: Sequence[tuple[float, float]]
+    miou: Sequence[float]
+    iou: Mapping[str, float]
+
+
+def read_curves(folder: Path, taxonomy: Taxonomy, epochs: int) -> Curves:
+    """Read the curves of a stage from its TensorBoard files.
+
+    Args:
+        folder: of the stage; files without the metrics give empty curves.
+        epochs: epochs of the stage.
+    """
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    names = set(events.Tags()["scalars"])
+
+    def by_step(name: str) -> dict[int, float]:
+        # A resumed run repeats the steps after its checkpoint: the last value counts.
+        return {event.step: event.value for event in events.Scalars(name)} if name in names else {}
+
+    loss = sorted(by_step(LOSS).items())
+    miou = [value for _, value in sorted(by_step(MIOU).items())]
+    validated = by_step(MIOU)
+    last = max([*validated, *(step for step, _ in loss)], default=0) + 1  # steps of the stage
+    iou = {}
+    for name in taxonomy.classes:
+        values = by_step(f"{CLASS}{name}")
+        if values and max(values) == max(validated, default=-1):
+            iou[name] = values[max(values)]
+    return Curves([((step + 1) / last * epochs, value) for step, value in loss], miou, iou)
+
+
+def draw_curves(stages: Mapping[str, Curves], path: Path) -> Path:
+    """Draw the curves of stages by their name, a row of three diagrams each; return the PNG."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    figure = Figure(figsize=(SIZE[0], SIZE[1] * len(stages)), layout="constrained")
+    rows = figure.subplots(len(stages), 3, squeeze=False)
+    for (name, curves), (loss, miou, iou) in zip(stages.items(), rows, strict=True):
+        if curves.loss:
+            marker = "." if len(curves.loss) < FEW else ""
+            loss.plot(*zip(*curves.loss, strict=True), color="black", linewidth=1, marker=marker)
+        loss.set_xlim(left=0)
+        _label(loss, f"{name}: loss", "epoch")
+
+        epochs = range(1, len(curves.miou) + 1)
+        miou.plot(epochs, [100 * value for value in curves.miou], color="black", marker=".")
+        miou.xaxis.set_major_locator(MaxNLocator(integer=True))
+        _label(miou, f"{name}: validation mIoU (%)", "epoch")
+        miou.set_ylim(bottom=0)
+
+        names = list(curves.iou)[::-1]  # the first class at the top
+        titles = [key.replace("$", "\\$") for key in names]  # no formulas
+        iou.barh(titles, [100 * curves.iou[key] for key in names], color="0.55")
+        iou.tick_params(axis="y", labelsize=7)
+        _label(iou, f"{name}: IoU by class (%), last epoch", "")
+        iou.set_xlim(0, 100)
+
+    with atomic_write(path) as part:
+        figure.savefig(part, dpi=DOTS_PER_INCH)
+    return path
+
+
+def _label(axes: Any, title: str, x: str) -> None:
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel(x)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
