@@ -55,6 +55,7 @@ _ROBOT_IDS: dict[Label, int] = {
     ),
     **dict.fromkeys([Label.PERSON, Label.BICYCLIST, Label.MOTORCYCLIST], 9),
 }
+ROBOT = "robot.yaml"
 _ROBOT_YAML = """\
 classes:
   ground: 3
@@ -223,6 +224,12 @@ class RobotLayout:
     out: Path
     number: int
 
+    @staticmethod
+    def place(out: Path, number: int) -> tuple[Path, bool]:
+        """Return the folder of a site, or if there is none the file that describes all sites."""
+        folder = out / _site(number)
+        return (folder, False) if os.path.lexists(folder) else (out / ROBOT, True)
+
     @property
     def folder(self) -> Path:
         return self.out / _site(self.number)
@@ -253,7 +260,7 @@ class RobotLayout:
         """Write robot.yaml; the last of several sites validates."""
         *train, val = [sequence["site"] for sequence in sequences]
         split = f"split:\n  train: [{', '.join(train)}]\n  val: {val}\n" if train else ""
-        write_whole(out / "robot.yaml", (_ROBOT_YAML + split).encode())
+        write_whole(out / ROBOT, (_ROBOT_YAML + split).encode())
 
 
 LAYOUTS: Mapping[str, type[SemanticKittiLayout] | type[NuScenesLayout] | type[RobotLayout]] = {

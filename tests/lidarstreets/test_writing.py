@@ -232,3 +232,23 @@ def test_the_files_that_the_tables_name_are_there(nuscenes: Path) -> None:
         labels = np.fromfile(nuscenes / row["filename"], np.uint8)
         assert len(labels) == 32 * 1084
         assert labels.max() < len(table(nuscenes, "category"))
+
+
+@pytest.mark.parametrize("name", ["robot.yaml", "site_a/truth/0000.npy"])
+def test_a_robot_does_not_replace_files_that_were_not_simulated(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("mine")
+    with pytest.raises(SimulationError, match="another folder"):
+        simulate(tmp_path, sensor="vlp16", scans=1)
+    assert path.read_text() == "mine"
+
+
+def test_a_robots_scans_can_be_extended(tmp_path: Path) -> None:
+    for sequences in (1, 2, 2):
+        simulate(tmp_path, sensor="vlp16", sequences=sequences, scans=1)
+    assert "val: site_b" in (tmp_path / "robot.yaml").read_text()
+    labels = np.load(tmp_path / "site_b/truth/0000.npy")
+    assert set(labels.tolist()) <= {-1, 3, 7, 9, 21, 22, 40}
+    header = (tmp_path / "site_b/clouds/0000.pcd").read_bytes()
+    assert f"POINTS {len(labels)}\n".encode() in header
