@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.find import find_scans, list_scans, read_cloud
 from amvnet.data.formats.rows import RowLayout, parse_layout
 from amvnet.data.formats.text import find_table
@@ -324,3 +325,25 @@ def test_a_pattern_takes_the_scans_of_many_drives(tmp_path: Path) -> None:
     names = [scan.name for scan in list_scans(tmp_path / "*/velodyne_points/data")]
     folder = "_sync/velodyne_points/data/0000000000"
     assert names == [f"2011_09_26_drive_0001{folder}", f"2011_09_26_drive_0005{folder}"]
+
+
+def test_patterns_of_any_folders_follow_links_once(table: np.ndarray, tmp_path: Path) -> None:
+    drives = tmp_path / "drives"
+    elsewhere = tmp_path / "disk"
+    for folder in (drives / "a", elsewhere / "deep"):
+        folder.mkdir(parents=True)
+        (folder / "0.bin").write_bytes(row_bytes(table[:, :4], "float32"))
+    (drives / "b").symlink_to(elsewhere)
+    for name in ("up", "again"):  # many ways around in circles
+        (drives / "a" / name).symlink_to(drives)
+        (elsewhere / "deep" / name).symlink_to(drives)
+    (drives / "0").symlink_to(drives / "a")  # the folder has its own name
+
+    expected = [drives / "a/0.bin", drives / "b/deep/0.bin"]
+    assert find_scans(drives / "**/*.bin") == expected
+    assert find_scans(drives / "*/**/0.bin")
+    path = drives / "own.yaml"
+    path.write_text('classes: {a: 1}\nscans: "**/*.bin"\n')
+    data = open_dataset(str(path))
+    records = data.records(data.sequences("all"))
+    assert [record.points_path for record in records] == expected

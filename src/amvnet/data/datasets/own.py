@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import glob
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
+from amvnet.data.formats.find import ANY_FOLDERS, NamedScan, list_scans, matching, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, USUAL_TYPE, RowLayout
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_raw_labels
@@ -220,6 +221,8 @@ class OwnScans(Dataset):
         pattern = self.description.scans
         try:
             matches = sorted(self.root.glob(pattern))
+            if ANY_FOLDERS in Path(pattern).parts:  # Python's own does not follow links
+                matches = matching(Path(glob.escape(str(self.root))) / pattern)
         except (ValueError, NotImplementedError, IndexError, OSError) as error:
             reason = "" if isinstance(error, IndexError) else f" ({reason_of(error)[:160]})"
             raise InputError(

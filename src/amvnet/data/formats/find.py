@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import glob
 import os
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,6 +29,7 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
 
+ANY_FOLDERS = "**"  # in a pattern
 POSE_COLUMNS = 12  # KITTI's files of poses have a 3 x 4 matrix in each line
 
 
@@ -178,14 +181,51 @@ def _scans_in(folder: Path) -> list[Path]:
 def _matches(pattern: str) -> list[Path]:
     """Return the scans that match a pattern, and the scans in folders that match."""
     paths: list[Path] = []
-    for text in sorted(glob.glob(pattern, recursive=True)):
-        path = Path(text)
+    for path in matching(Path(pattern)):
         if is_scan_file(path) or _is_text_scan(path):
             paths.append(path)
         elif path.is_dir() and "**" not in pattern:
             paths += _scans_in(path)
 
     return paths
+
+
+def matching(pattern: Path) -> list[Path]:
+    """Return the paths that match a pattern, sorted; `**` also follows links to folders."""
+    parts = pattern.parts
+    if ANY_FOLDERS not in parts:
+        return sorted(map(Path, glob.glob(str(pattern))))
+
+    index = parts.index(ANY_FOLDERS)
+    paths: set[Path] = set()
+    for top in matching(Path(*parts[:index])) if index else [Path()]:
+        for folder in _folders_below(top):
+            # What is before the pattern is a name, whatever characters it has.
+            rest = Path(*parts[index + 1 :]) if parts[index + 1 :] else Path("*")
+            paths.update(matching(Path(glob.escape(str(folder))) / rest))
+    return sorted(paths)
+
+
+def _folders_below(top: Path) -> list[Path]:
+    """Return a folder and all below it, each once, without hidden ones; links come last.
+
+    A link may lead to a folder that it is in, or that has been listed by its own name.
+    """
+    seen: set[Path] = set()
+    folders = []
+    waiting = deque([top])
+    links: deque[Path] = deque()
+    while waiting or links:
+        folder = waiting.popleft() if waiting else links.popleft()
+        if not folder.is_dir() or folder.resolve() in seen:
+            continue
+        seen.add(folder.resolve())
+        folders.append(folder)
+        with suppress(OSError):  # a folder that may not be read
+            for child in sorted(folder.iterdir()):
+                if child.is_dir() and not child.name.startswith("."):
+                    (links if child.is_symlink() else waiting).append(child)
+    return folders
 
 
 def _advice_to_find(path: Path) -> str:
