@@ -362,3 +362,15 @@ def test_without_the_official_split_the_last_sequence_validates_and_tests_are_le
     scans = split_records(dataset, None, None)
     assert tuple(record.sequence for record in scans.train) == train
     assert tuple(record.sequence for record in scans.val) == val
+
+
+def test_only_key_frames_of_nuscenes_are_scans(tmp_path: Path) -> None:
+    layout = make_nuscenes(tmp_path)
+    path = tmp_path / "v1.0-mini/sample_data.json"
+    rows = json.loads(path.read_text())
+    for row in rows:
+        if row["token"] == "scene-0103-9":
+            row["is_key_frame"] = False
+    path.write_text(json.dumps(rows))
+    names = {record.name for record in open_dataset(layout.spec).records(layout.sequences)}
+    assert names == {"scene-0103-8", "scene-0061-9", "scene-0061-8"}

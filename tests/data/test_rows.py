@@ -9,7 +9,7 @@ import pytest
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.find import find_scans, list_scans, read_cloud
-from amvnet.data.formats.rows import RowLayout, parse_layout
+from amvnet.data.formats.rows import RowLayout, are_rings, parse_layout
 from amvnet.data.formats.text import find_table
 
 from fixtures.sensors import LASERS, place
@@ -347,3 +347,11 @@ def test_patterns_of_any_folders_follow_links_once(table: np.ndarray, tmp_path: 
     data = open_dataset(str(path))
     records = data.records(data.sequences("all"))
     assert [record.points_path for record in records] == expected
+
+
+def test_equally_frequent_labels_with_gaps_are_no_rings() -> None:
+    rng = np.random.default_rng(0)
+    xyz = rng.normal(0, 10, (2600, 3))
+    labels = np.arange(2600) % 26
+    assert are_rings(xyz, labels)
+    assert not are_rings(xyz, labels * 9)

@@ -170,3 +170,10 @@ def test_aliases_in_yaml_are_refused_and_anchors_are_not(tmp_path: Path) -> None
     for text in ("a: &a [1]\nb: *a\n", "a: &a {k: 1}\nb: {<<: *a}\n", "&a [*a]"):
         path.write_text(text)
         fails(lambda: read_yaml(path, "a list"), path, "*a", "write its value out")
+
+
+def test_a_text_file_of_poses_is_no_scan(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "poses.txt", np.eye(12))
+    fails(lambda: find_scans(tmp_path), tmp_path, "found none")
+    np.savetxt(tmp_path / "scan.txt", np.ones((4, 4)))
+    assert find_scans(tmp_path) == [tmp_path / "scan.txt"]

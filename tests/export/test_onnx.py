@@ -28,7 +28,7 @@ from amvnet.export import onnx as onnx_export
 from amvnet.export.onnx import describe_export
 from amvnet.models.methods import BOTH_NETWORKS, MethodName
 from amvnet.models.neighbours import nearest_others
-from amvnet.onnx_runner import OnnxSegmenter, pool
+from amvnet.onnx_runner import DESCRIPTION, OnnxSegmenter, pool
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES, QUANTILES
 from amvnet.weights.file import Weights, save
@@ -463,3 +463,29 @@ def test_the_page_runs(exported: Exports, tmp_path: Path, monkeypatch: pytest.Mo
     for block in re.findall(r"(?s)```python\n(.*?)```", page):
         exec(block, scope)
     assert len(scope["result"].labels) == POINTS
+
+
+def test_a_graph_that_computes_nan_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(onnx_export, "_difference", lambda *arguments: math.nan)
+    graph = onnx_export.Graph(torch.nn.ReLU(), {"x": torch.ones(2, 3)}, "y", torch.abs)
+    fails(lambda: onnx_export._write(graph, "range_net", tmp_path / "a.onnx"), "range_net", "nan")
+
+
+def test_an_interrupted_export_leaves_no_description_of_other_graphs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(weights: object, method: object, scans: object, folder: Path, step: object) -> Any:
+        (folder / "range_net.onnx").write_bytes(b"new")
+        return {"graphs": {"range_net": {}}}
+
+    def stop(part: Path, path: Path) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / DESCRIPTION).write_text("of earlier graphs")
+    monkeypatch.setattr(onnx_export, "_write_all", write)
+    monkeypatch.setattr(onnx_export, "publish", stop)
+    with pytest.raises(KeyboardInterrupt):
+        onnx_export.export(fresh_weights(), tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -323,3 +323,13 @@ def test_uncertain_points_next_to_scans_are_not_scans(world: Path, tmp_path: Pat
 def test_an_unknown_format_gives_an_error_of_one_line(world: Path, tmp_path: Path) -> None:
     message = failure(world, tmp_path, world / "scans/a.bin", "--format", "xyz")
     assert "ply" in message
+
+
+@pytest.mark.parametrize(("x", "kind"), [(400.0, "float"), (400_000.01, "double")])
+def test_coordinates_are_exact_to_half_a_millimetre(x: float, kind: str, tmp_path: Path) -> None:
+    """At 400 km, float32 would be off by up to 16 mm."""
+    xyz = np.full((3, 3), x)
+    path = write_scan_labels(tmp_path / "a", "ply", xyz, np.ones(3, np.uint8), SEMANTICKITTI)
+    assert f"property {kind} x".encode() in path.read_bytes()
+    vertex = plyfile.PlyData.read(path)["vertex"]
+    np.testing.assert_allclose(vertex["x"], x, atol=0.0005)

@@ -23,9 +23,11 @@ from amvnet.sensors.intensity import (
     QUANTILES,
     TrainedIntensity,
     match_scan,
+    matching,
     trained_intensity,
 )
-from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.lidars import Sensor, rotation_from_degrees
+from amvnet.sensors.measure import MEASURED, Recording
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights
 
@@ -288,3 +290,36 @@ def test_a_network_of_real_scans_ends_the_matching(parts: tuple[str, ...]) -> No
     trained = trained_intensity(records, "hdl64e")
     assert trained is not None
     assert not trained.is_matched
+
+
+def test_matched_intensities_stay_at_most_one() -> None:
+    """Scans of a training may have been brighter."""
+    quantiles = np.linspace(0, 1, len(PROBABILITIES))
+    levels, becomes = matching(quantiles, (2 * quantiles).tolist())
+    np.testing.assert_allclose(levels, quantiles)
+    np.testing.assert_allclose(becomes, np.minimum(2 * quantiles, 1))
+
+
+def test_a_few_wild_intensities_do_not_decide_the_range() -> None:
+    intensity = np.linspace(0, 1, 10_000)
+    intensity[:5] = 300
+    cloud = Cloud(np.ones((len(intensity), 3)), intensity)
+    assert cloud.intensity_scale() == 1
+    intensity[:50] = 300
+    assert cloud.intensity_scale() == 65535
+
+
+def test_scans_that_sway_have_the_intensities_of_their_recording() -> None:
+    recording = Recording(Sensor(), None)
+    points, _ = place(LASERS["os1-64"], 1.73)
+    for number in range(MEASURED + 2):
+        pitch = 8 if number % 2 else -8
+        xyz = points[:, :3].astype(np.float64) @ rotation_from_degrees(0, pitch, 0).T
+        cloud = Cloud(xyz, np.linspace(0, 0.6 + 0.01 * number, len(xyz)), name="a")
+        estimate, is_usual = recording.estimate(cloud)
+
+    assert is_usual
+    assert recording.usual is not None
+    assert not recording.usual.is_steady
+    assert estimate.quantiles is not None
+    np.testing.assert_array_equal(estimate.quantiles, recording.usual.quantiles)

@@ -23,7 +23,7 @@ from amvnet.inference.reading import normaliser_for
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
-from amvnet.sensors.lasers import measure
+from amvnet.sensors.lasers import SensorGeometry, measure
 from amvnet.sensors.lidars import (
     AXES,
     HEIGHTS,
@@ -531,3 +531,18 @@ def test_random_bytes_as_points_give_no_warning(seed: int) -> None:
         raised = raise_points(Scan(points), 0.5)
     finite = np.isfinite(points[:, 2]) & (np.abs(points[:, 2]) < 1e30)
     assert np.allclose(raised.points[finite, 2], points[finite, 2] + np.float32(0.5))
+
+
+@pytest.mark.parametrize(("beams", "other"), [(16, 64), (64, 16), (32, 64)])
+def test_sensors_with_far_more_or_fewer_lasers_are_not_alike(beams: int, other: int) -> None:
+    assert not SensorGeometry(beams, 10, -20).is_like(SensorGeometry(other, 10, -20))
+    assert SensorGeometry(beams, 10, -20).is_like(SensorGeometry(beams + 2, 10, -20))
+
+
+def test_a_stated_unit_settles_that_a_sensor_is_high() -> None:
+    weights = replace(fresh_weights(), sensor="hdl64e")
+    points, _ = place(LASERS["os1-64"], 6.0)
+    cloud = Cloud(points[:, :3], np.linspace(0, 0.6, len(points)), name="a")
+    fails(lambda: normaliser_for(weights)(cloud, "a"), "--unit")
+    assert normaliser_for(weights, Sensor(unit="m"))(cloud, "a").valid.any()
+    assert normaliser_for(weights, Sensor(height=6.0))(cloud, "a").valid.any()

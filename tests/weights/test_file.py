@@ -297,3 +297,13 @@ def test_weights_that_name_values_of_removed_options_are_read(
     earlier = tmp_path / "earlier.safetensors"
     save_file(dict(weights.tensors), earlier, metadata={"amvnet": json.dumps(description)})
     assert load(earlier).model == weights.model
+
+
+def test_weights_for_other_classes_leave_the_random_state_as_it_was() -> None:
+    weights = fresh_weights()
+    few = replace(weights.taxonomy, name="few")
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    weights.for_classes(few, seed=1)
+    assert torch.equal(torch.rand(3), expected)
