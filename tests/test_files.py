@@ -33,6 +33,7 @@ from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.segmenter import Segmentation
 from amvnet.scan import Scan
 from amvnet.weights.file import save
+from lidarstreets.layouts import write_whole
 
 from fixtures.datasets import MAKERS, make_nuscenes
 from fixtures.worlds import fails, fresh_weights, refusal, run_cli, street, write_recipe
@@ -363,6 +364,11 @@ def test_simulated_scans_are_not_written_through_a_link(link: str) -> None:
 # ---- one file
 
 
+def write_file(path: Path, content: bytes) -> None:
+    with atomic_write(path) as part:
+        part.write_bytes(content)
+
+
 @pytest.fixture(params=[0o022, 0o077, 0o002])
 def umask(request: pytest.FixtureRequest) -> Iterator[int]:
     earlier = os.umask(request.param)
@@ -442,6 +448,20 @@ def test_an_error_of_the_disk_names_the_file_and_not_its_temporary_name(
         pass
     assert caught.value.filename == str(tmp_path / "a")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("write", [write_file, write_whole])
+def test_a_read_only_folder_is_one_line_that_names_the_file(
+    write: Callable[[Path, bytes], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *arguments: object, **options: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    for name in ("touch", "write_bytes", "unlink"):
+        monkeypatch.setattr(Path, name, refuse)
+    with pytest.raises(ValueError, match="Read-only file system; give another") as caught:
+        write(tmp_path / "a.txt", b"")
+    assert str(caught.value).startswith(f"{tmp_path}/a.txt: expected")
 
 
 def test_an_output_folder_that_is_a_file_is_called_one(tmp_path: Path) -> None:

@@ -254,6 +254,16 @@ def test_a_labelled_scan_is_not_replaced_by_labels_from_another_folder(
     assert contents(tmp_path / "scans") == before
 
 
+@pytest.mark.parametrize("name", ["predict", "rank", "figures", "pictures", "view", "analyze"])
+def test_a_read_only_folder_is_refused_before_the_work(
+    name: str, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    line = refusal(CASES[name].text(world, tmp_path / "new/out"))
+    assert f"{tmp_path}: expected a folder to write to, found one that is read-only" in line
+    assert not files(tmp_path)
+
+
 def test_a_device_is_not_replaced(world: Path) -> None:
     line = refusal(f"evaluate {world}/data --predictions {world}/predictions --json /dev/null")
     assert "found a device" in line

@@ -75,7 +75,8 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
             raise OSError(error.errno or errno.EIO, str(error), str(path)) from None
         raise
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # of a read-only file system
+            part.unlink(missing_ok=True)
         unfinished.discard(part)
 
 

@@ -47,7 +47,8 @@ def check_outputs(
     """Check that a command may write some files. Call this before the work.
 
     No file that the command reads is written, by whatever name or link. A file that exists is
-    replaced only if the user says so, and only by one of the same kind.
+    replaced only if the user says so, and only by one of the same kind. The folders of the files
+    may be written to, so that no time is wasted on results that have no place.
 
     Args:
         outputs: the files, and what each of them must be if it exists and is to be replaced.
@@ -59,6 +60,8 @@ def check_outputs(
     """
     existing = [path for path in outputs if os.path.lexists(path)]
     check_not_read(existing, inputs)
+    for folder in {path.parent for path in outputs}:
+        _check_writable(folder)
     for path in existing:
         found = _no_file(path)
         if found is not None:
@@ -111,6 +114,18 @@ def _identities(path: Path | str) -> Iterator[tuple[int, int]]:
             status = os.stat(path, follow_symlinks=follows)
             if not stat.S_ISDIR(status.st_mode):
                 yield status.st_dev, status.st_ino
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise InputError if a folder, or the first above it that exists, cannot be written to."""
+    place = folder
+    while not os.path.lexists(place) and place != place.parent:
+        place = place.parent
+    if place.is_dir() and not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(
+            f"{place}: expected a folder to write to, found one that is read-only for this user; "
+            "write to another place"
+        )
 
 
 def _no_file(path: Path) -> str | None:

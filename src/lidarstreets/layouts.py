@@ -1,5 +1,6 @@
 """Writes simulated scans in the layouts of SemanticKITTI and nuScenes-lidarseg, and of a robot."""
 
+import errno
 import hashlib
 import json
 import os
@@ -7,6 +8,7 @@ import threading
 import uuid
 from collections import defaultdict
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -68,6 +70,11 @@ scans: "*/clouds/*.pcd"
 labels: "../truth/{name}.npy"
 """
 
+# Errors of the system that another folder avoids.
+REFUSALS = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR),
+)
 WRITING = threading.Lock()  # held while a file is written
 
 _CATEGORIES = ("noise", *sorted({label.category for label in Label} - {"noise"}))
@@ -400,8 +407,11 @@ def write_whole(path: Path, content: bytes) -> None:
                 part.write_bytes(content)
                 os.replace(part, path)
             finally:
-                part.unlink(missing_ok=True)
-    except (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
+                with suppress(OSError):  # of a read-only file system
+                    part.unlink(missing_ok=True)
+    except OSError as error:
+        if error.errno not in REFUSALS:
+            raise
         raise SimulationError(
             f"{path}: expected a file that can be written, found {error.strerror}; "
             "give another folder"

@@ -261,12 +261,14 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
     five_last = out / "neighbours/5/head/last.safetensors"
     two_time = two_last.stat().st_mtime_ns
     five_time = five_last.stat().st_mtime_ns
-    succeed(command)
+    succeed(f"{command} --overwrite")
     assert two_last.stat().st_mtime_ns == two_time
     assert five_last.stat().st_mtime_ns == five_time
 
     save(fresh_weights(seed=1), world / "other.safetensors")
-    assert "networks" in refusal(command.replace("weights.safetensors", "other.safetensors"))
+    assert "networks" in refusal(
+        f"{command} --overwrite".replace("weights.safetensors", "other.safetensors")
+    )
 
 
 def test_taus_are_swept_with_heads_of_their_own(world: Path) -> None:

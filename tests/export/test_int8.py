@@ -9,8 +9,10 @@ import hashlib
 import json
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -228,3 +230,23 @@ def test_graphs_that_change_too_many_labels_are_one_line(
 ) -> None:
     monkeypatch.setattr(int8_export, "LEAST_AGREEMENT", 1.01)
     check_refused(weights, str(scans), tmp_path, "calibrate with more scans")
+
+
+def test_a_graph_is_calibrated_without_the_scans_of_its_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calibrated: list[Any] = []
+    recorder: Any = SimpleNamespace(recorded={"range_net": []}, replace=lambda name, path: None)
+
+    def labels(segmenter: Any, name: str, scans: Sequence[Any]) -> np.ndarray:
+        recorder.recorded.setdefault(name, []).extend(scans)
+        return np.zeros(len(scans))
+
+    monkeypatch.setattr(int8_export, "_Recorder", lambda folder: recorder)
+    monkeypatch.setattr(int8_export, "_labels", labels)
+    monkeypatch.setattr(int8_export, "_write", lambda path, inputs: calibrated.extend(inputs))
+    monkeypatch.setattr(int8_export, "digest", lambda path: "")
+    scans: Any = list(range(12))
+    ((_, changes),) = int8_export.quantise(tmp_path, ["range_net"], scans)
+    assert calibrated == [1, 2, 3, 4, 6, 7, 8, 9, 11]
+    assert changes["agreement"] == 1

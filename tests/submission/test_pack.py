@@ -139,7 +139,8 @@ def test_a_fault_leaves_the_old_archive(case: Case, tmp_path: Path) -> None:
     folder = tmp_path / "p"
     out = tmp_path / "s.zip"
     write_files(folder, case.good)
-    out.write_bytes(b"of yesterday")
+    of_yesterday = b"PK\3\4" + bytes(26) + b"sequences/PK"
+    out.write_bytes(of_yesterday)
 
     prediction = folder / case.last
     content = prediction.read_bytes()
@@ -153,7 +154,7 @@ def test_a_fault_leaves_the_old_archive(case: Case, tmp_path: Path) -> None:
         assert code == 2
         assert error.count("\n") == 1
         assert case.last in error
-        assert out.read_bytes() == b"of yesterday"
+        assert out.read_bytes() == of_yesterday
         assert sorted(tmp_path.iterdir()) == [folder, out]
 
 

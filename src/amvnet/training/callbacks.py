@@ -113,7 +113,7 @@ class KeepWeights(Callback):
         if plan.processes.first:  # the others do not write
             sensor = sensor_record(plan.scans.dataset, plan.scans.train, intensity)
             self.record = stage_record(plan, self.settings, sensor)
-        self.started = time.time()
+        self.started = time.monotonic()  # a clock may be set back
         self.highest = -1.0  # mIoU of the best weights so far
 
     def state_dict(self) -> dict[str, Any]:
@@ -147,7 +147,7 @@ class KeepWeights(Callback):
 
     def _trained(self, state: dict[str, Tensor], metrics: dict[str, float]) -> Weights:
         """Return the weights of the trained part alone, given its parameters."""
-        seconds = round(time.time() - self.started)
+        seconds = round(time.monotonic() - self.started)
         return dataclasses.replace(
             self.weights,
             tensors=part_state(self.part, state),

@@ -37,8 +37,8 @@ def rank(
     from amvnet.weights.file import load
 
     # Before any scan is scored, so that no time is wasted.
-    make_folder(out.parent)
     check_outputs({out: TABLE}, [data, weights], overwrite)
+    make_folder(out.parent)
     loaded = load(weights)
     dataset = open_for_weights(data, loaded)
     records = choice.records(dataset, "all")
