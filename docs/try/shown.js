@@ -45,19 +45,19 @@ function bestTwo(scores, indices, k) {
       if (row[c] > row[first]) [first, second] = [c, first];
       else if (second < 0 || row[c] > row[second]) second = c;
     }
-    best.firstShare[place] = Math.round((100 * row[first]) / sum);
+    // Two networks that are wholly sure of different classes leave no score at all.
+    const percent = (c) => Math.round(100 * (sum > 0 ? row[c] / sum : 1 / k));
+    best.firstShare[place] = percent(first);
     if (second < 0) return;
     best.second[place] = second + 1;
-    best.secondShare[place] = Math.round((100 * row[second]) / sum);
+    best.secondShare[place] = percent(second);
   });
   return best;
 }
 
 function noteOf(leftOut, stride) {
-  const notes = [];
-  if (leftOut) notes.push(`${counted(leftOut)} without a position or beyond ${REACH} m`);
-  if (stride > 1) notes.push(`one in ${stride} of the scan`);
-  return notes.join("; ");
+  const missing = leftOut ? `${counted(leftOut)} without a position or beyond ${REACH} m` : "";
+  return [missing, stride > 1 ? `one in ${stride} of the scan` : ""].filter(Boolean).join("; ");
 }
 
 /** Return {center, step, positions}: the points as multiples of a step, in int16. */

@@ -38,8 +38,13 @@ async function label({ id, file, folder, isPreview }) {
   if (isPreview) return;
 
   runtime ??= await start(new URLSearchParams(location.search).get("device"));
-  const networks = await load(folder, description, (share) => send("loading", { share }));
-  const segmentation = await segment(networks, scan, step);
+  const run = async () => segment(await load(folder, description, (share) => send("loading", { share })), scan, step);
+  const segmentation = await run().catch(async (error) => {
+    if (runtime.device === "wasm" || error instanceof InputError) throw error;
+    runtime = await start("wasm");  // the GPU cannot do it
+    loaded = { folder: null, networks: null };
+    return run();
+  });
   const shown = shownScan(file.name, scan, segmentation, description);
   const labels = segmentation.labels[description.method], { places, count: total } = scan;
   send("labelled", { ...shown, labels, places, total, classes: description.classes, device: runtime.text });
@@ -61,9 +66,9 @@ function expectationOf({ range_view: view, normalise: { sensor, intensity, as_is
   return { view, sensor, intensity, isAsIs };
 }
 
-/** Load ONNX Runtime, for the GPU if the browser offers one; `wanted` may be "wasm". Returns {ort, device, text}. */
+/** Load ONNX Runtime, for the GPU if `wanted` is "webgpu" and the browser offers one. Returns {ort, device, text}. */
 async function start(wanted) {
-  const isPossible = wanted !== "wasm" && "Suspending" in WebAssembly;
+  const isPossible = wanted === "webgpu" && "Suspending" in WebAssembly;
   const adapter = isPossible ? await navigator.gpu?.requestAdapter() : null, device = adapter ? "webgpu" : "wasm";
   const ort = await import(`./ort/ort.${adapter ? "jspi" : "wasm"}.min.mjs`);
   const threads = crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, MOST_THREADS) : 1;
