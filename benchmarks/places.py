@@ -1,11 +1,12 @@
 """Score weights place by place, as an easy place may hide what the others lack.
 
-    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--methods M,...] [--every N]
+    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--every N] [--calibrated B]
 
 DATA is a dataset such as semantickitti:PATH; each of its sequences is a place. Print mIoU over all
 classes and accuracy of each method, and the share of uncertain points, for each place and for all.
-With --no-intensity, the intensities of all scans are set to 0. --methods are those of
-`amvnet evaluate`. With --every N, only every Nth scan is scored.
+With --no-intensity, the intensities of all scans are set to 0. With --every N, only every Nth scan
+is scored. For weights of `benchmarks/calibrate.py --bev B`, --calibrated B also scores the plain
+ensemble, in which both networks have the same weight as in the paper.
 """
 
 from __future__ import annotations
@@ -22,9 +23,7 @@ import amvnet
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
-from amvnet.evaluation.scoring import labels_by_method
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.methods import PAPER_METHODS
 from amvnet.scan import Scan
 
 
@@ -32,18 +31,32 @@ def score(
     dataset: Dataset,
     records: Sequence[ScanRecord],
     segmenter: Segmenter,
-    methods: Sequence[str],
     intensity: bool,
+    calibrated: float | None,
 ) -> Evaluation:
-    """Score some methods on some scans."""
+    """Score the methods of the paper on some scans."""
     evaluation = Evaluation(dataset.taxonomy)
     for record in records:
         scan = dataset.read(record)
-        shown = scan if intensity else without_intensity(scan)
-        ids, uncertain = labels_by_method(segmenter, shown, methods)
+        result = segmenter(scan if intensity else without_intensity(scan))
         assert scan.labels is not None
-        evaluation.add(scan.points, scan.labels, ids, uncertain)
+        assert result.rv is not None
+        assert result.bev is not None
+
+        scores = {"rv": result.rv, "bev": result.bev}
+        if calibrated is not None:
+            scores["plain"] = plain(result.rv, result.bev, calibrated)
+        scores |= {"ensemble": result.rv * result.bev, "amvnet": result.scores}
+        ids = {}
+        for name, values in scores.items():
+            ids[name] = np.where(result.labels > 0, values.argmax(axis=1) + 1, 0)
+        evaluation.add(scan.points, scan.labels, ids, result.uncertain)
     return evaluation
+
+
+def plain(f: np.ndarray, g: np.ndarray, bev: float) -> np.ndarray:
+    """Return scores (N, K) of the ensemble as it would be without `calibrate.py --bev`."""
+    return f ** (1 / (2 - 2 * bev)) * g ** (1 / (2 * bev))
 
 
 def without_intensity(scan: Scan) -> Scan:
@@ -70,13 +83,13 @@ def main() -> None:
     parser.add_argument("data")
     parser.add_argument("weights")
     parser.add_argument("--no-intensity", action="store_true")
-    parser.add_argument("--methods", default=",".join(PAPER_METHODS))
     parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--calibrated", type=float, metavar="B")
     options = parser.parse_args()
 
     dataset = open_dataset(options.data)
     segmenter = amvnet.load(options.weights)
-    methods = options.methods.split(",")
+    methods = ["rv", "bev", *(["plain"] if options.calibrated else []), "ensemble", "amvnet"]
     chosen = dataset.records(dataset.sequences("all"))[:: options.every]
     table = Table("place", *methods, "uncertain, %")
     total = Evaluation(dataset.taxonomy)
@@ -85,7 +98,11 @@ def main() -> None:
         if not records:
             continue
         evaluation = score(
-            dataset, records, segmenter, methods=methods, intensity=not options.no_intensity
+            dataset,
+            records,
+            segmenter,
+            intensity=not options.no_intensity,
+            calibrated=options.calibrated,
         )
         add_row(table, place, evaluation, dataset.taxonomy.size)
         total += evaluation

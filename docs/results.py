@@ -16,7 +16,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs/results.json"
-METHODS = ("rv", "bev", "ensemble", "amvnet")
+METHODS = ("rv", "bev", "plain", "ensemble", "amvnet")
 REGION = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.S)
 
 
@@ -61,13 +61,16 @@ PAGES = {
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as a table in Markdown, the best method of each in bold."""
     lines = [
-        "| Scans | Weights | RV | BEV | Ensemble | AMVNet | Uncertain |",
-        "|---|---|---|---|---|---|---|",
+        "| Scans | Weights | RV | BEV | Plain ensemble | Ensemble | AMVNet | Uncertain |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        best = max(row[method] for method in METHODS)
+        best = max(row[method] for method in METHODS if method in row)
         cells = [row["scans"], f"`{row['weights']}`"]
         for method in METHODS:
+            if method not in row:
+                cells.append("")
+                continue
             text = f"{row[method]:.1f}"
             cells.append(f"**{text}**" if row[method] == best else text)
         cells.append(f"{row['uncertain']:g} %" if "uncertain" in row else "")
