@@ -5,7 +5,7 @@
 DATA is a dataset such as semantickitti:PATH; each of its sequences is a place. Print mIoU over all
 classes and accuracy of each method, and the share of uncertain points, for each place and for all.
 With --no-intensity, the intensities of all scans are set to 0. With --every N, only every Nth scan
-is scored. For weights of `benchmarks/calibrate.py --bev B`, --calibrated B also scores the plain
+is scored. For weights of `amvnet.weights.calibrate --bev B`, --calibrated B also scores the plain
 ensemble, in which both networks have the same weight as in the paper.
 """
 
@@ -55,7 +55,7 @@ def score(
 
 
 def plain(f: np.ndarray, g: np.ndarray, bev: float) -> np.ndarray:
-    """Return scores (N, K) of the ensemble as it would be without `calibrate.py --bev`."""
+    """Return scores (N, K) of the ensemble as it would be without calibration."""
     return f ** (1 / (2 - 2 * bev)) * g ** (1 / (2 * bev))
 
 

@@ -172,10 +172,7 @@ VERBS = (
     *("analyze", "ablate", "export", "view", "bench", "info"),
 )
 BUILT_IN_RECIPES = (
-    *("semantickitti", "semantickitti-no-rnn", "semantickitti-polarnet"),
-    *("semantickitti-compact", "semantickitti-no-rnn-compact", "semantickitti-polarnet-compact"),
-    *("nuscenes", "nuscenes-no-rnn", "nuscenes-polarnet"),
-    *("nuscenes-compact", "nuscenes-no-rnn-compact", "nuscenes-polarnet-compact"),
+    *("semantickitti", "semantickitti-compact", "nuscenes", "nuscenes-compact"),
     *("simulated", "simulated-compact", "simulated-hdl32e-compact"),
 )
 

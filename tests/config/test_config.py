@@ -51,10 +51,7 @@ def test_a_recipe_survives_the_way_to_json_and_yaml_and_back(name: str) -> None:
 
 
 def test_every_builtin_recipe_is_there() -> None:
-    full_size = {"simulated"}
-    for benchmark in ("semantickitti", "nuscenes"):
-        full_size |= {benchmark, f"{benchmark}-polarnet", f"{benchmark}-no-rnn"}
-        full_size |= {f"{benchmark}-plus"}
+    full_size = {"semantickitti", "nuscenes", "simulated"}
     compact = {f"{name}-compact" for name in full_size} | {"simulated-hdl32e-compact"}
 
     assert set(recipe_names()) == full_size | compact | {"finetune"}
@@ -105,12 +102,8 @@ def test_a_recipes_stages_fit_each_other(name: str) -> None:
 
 @pytest.mark.parametrize("recipe", ["semantickitti", "nuscenes"])
 @pytest.mark.parametrize("size", ["", "-compact"])
-def test_the_pure_recipes_have_no_option_of_the_plus_recipes(recipe: str, size: str) -> None:
-    pure = load_recipe(f"{recipe}{size}").model
-    plus = load_recipe(f"{recipe}-plus{size}").model
-    assert pure.point_head == PointHeadConfig()
-    assert plus.point_head.share == 0.5
-    assert dataclasses.replace(plus, point_head=pure.point_head) == pure
+def test_the_recipes_of_the_benchmarks_have_the_papers_head(recipe: str, size: str) -> None:
+    assert load_recipe(f"{recipe}{size}").model.point_head == PointHeadConfig()
 
 
 def test_an_empty_tree_gives_the_defaults() -> None:

@@ -223,7 +223,7 @@ def test_the_networks_of_the_shipped_weights_are_those_of_their_recipe(
 ) -> None:
     expected = load_recipe(recipe).model
     model = load(weights).model
-    for part in ("range_net", "polar_net", "point_head"):
+    for part in ("range_view", "polar_view", "range_net", "polar_net", "point_head"):
         assert getattr(model, part) == getattr(expected, part)
     assert model.assertion == expected.assertion
 

@@ -1,9 +1,7 @@
-"""benchmarks/calibrate.py, which the built-in weights went through."""
+"""The calibration, which the built-in weights went through."""
 
 from __future__ import annotations
 
-import runpy
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,27 +9,27 @@ import numpy as np
 import pytest
 
 import amvnet
+from amvnet.errors import InputError
 from amvnet.scan import Scan
+from amvnet.training.losses import class_weights
+from amvnet.weights.calibrate import calibrate, read_counts
+from amvnet.weights.file import load, save
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks/calibrate.py"
+from fixtures.worlds import fresh_weights, without
+
 WEIGHTS = "sim-hdl64e"
 
 
-def calibrated(tmp_path: Path, counts: np.ndarray, *options: str) -> Path:
+def calibrated(tmp_path: Path, counts: np.ndarray, prior: float, bev: float) -> Path:
     """Return the file of the calibrated weights."""
-    np.savez(tmp_path / "counts.npz", counts=counts)
-    out = tmp_path / "calibrated.safetensors"
-    with pytest.MonkeyPatch.context() as patch:
-        files = [WEIGHTS, str(tmp_path / "counts.npz"), str(out)]
-        patch.setattr(sys, "argv", [str(SCRIPT), *files, *options])
-        runpy.run_path(str(SCRIPT), run_name="__main__")
-    return out
+    weights = calibrate(load(WEIGHTS), counts, prior, bev)
+    return save(weights, tmp_path / "calibrated.safetensors")
 
 
 def test_the_ensemble_weighs_the_networks_and_their_labels_stay(
     tmp_path: Path, random_scan: Callable[..., Scan]
 ) -> None:
-    path = calibrated(tmp_path, np.ones(19), "--prior", "0", "--bev", "0.7")
+    path = calibrated(tmp_path, np.ones(19), prior=0, bev=0.7)
     scan = random_scan(2000)
     before = amvnet.load(WEIGHTS, method="ensemble")(scan)
     after = amvnet.load(path, method="ensemble")(scan)
@@ -60,6 +58,33 @@ def test_rare_classes_are_named_less_often(
     counts = np.full(19, 1e6)
     counts[rare] = 1e3
 
-    path = calibrated(tmp_path, counts, "--prior", "0.5", "--bev", "0.5")
+    path = calibrated(tmp_path, counts, prior=0.5, bev=0.5)
     after = amvnet.load(path, method="rv")(scan).labels
     assert (after == rare + 1).sum() < 0.9 * named[rare]
+
+
+def test_the_shift_undoes_a_share_of_the_class_weights() -> None:
+    counts = np.random.default_rng(0).integers(0, 10**6, 19)
+    counts[3] = 0
+    weights = fresh_weights()
+    shifted = calibrate(weights, counts, prior=0.2, bev=0.5)
+    shift = shifted.tensors["range_net.scores.bias"] - weights.tensors["range_net.scores.bias"]
+    expected = -0.4 * np.log(class_weights(counts))
+    np.testing.assert_allclose(shift, expected - expected.mean(), atol=1e-5)
+
+
+@pytest.mark.parametrize("bev", [0, 1, -0.5, float("nan")])
+def test_an_impossible_weight_is_an_input_error(bev: float) -> None:
+    with pytest.raises(InputError, match="above 0 and below 1"):
+        calibrate(fresh_weights(), np.ones(19), bev=bev)
+
+
+def test_other_classes_or_a_missing_network_are_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="19 classes"):
+        calibrate(fresh_weights(), np.ones(16))
+    with pytest.raises(InputError, match="polar_net"):
+        calibrate(without(fresh_weights(), "polar_net"), np.ones(19))
+    (tmp_path / "counts.npz").write_text("no counts")
+    for name in ("counts.npz", "missing.npz"):
+        with pytest.raises(InputError, match="class_counts"):
+            read_counts(tmp_path / name)

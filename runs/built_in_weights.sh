@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Train the built-in weights, from streets to OUT/head/weights.safetensors; started again, it goes on.
 #
-#     benchmarks/shipped_weights.sh hdl64e|hdl32e OUT [INIT] [--KEY VALUE ...]
+#     runs/built_in_weights.sh hdl64e|hdl32e OUT [INIT] [--KEY VALUE ...]
 #
 # INIT are weights to begin with, such as sim-hdl64e; options of `amvnet train` may follow. An epoch is
 # 6,000 scans of 1,000 streets, which are other streets in each epoch. A network takes 0.5 to 1 s a scan on a CPU core, and 4 minutes
@@ -18,17 +18,15 @@ fi
 case $sensor in
     hdl64e)
         recipe=simulated-compact
-        small=(--model.range_view.width 1536)
         calibration=()
         ;;
     hdl32e)
         recipe=simulated-hdl32e-compact
-        small=(--model.polar_view.radial 240 --model.polar_view.angular 180)
         calibration=(--prior 0 --bev 0.75)
         ;;
     *) echo "expected hdl64e or hdl32e, found $sensor" >&2 && exit 2 ;;
 esac
-train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --resume "${small[@]}")
+train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --resume)
 
 # Both networks at the same time, one on each core of a small machine.
 networks=(--train-sequences "$(seq -s, 0 999)" --training.rv.region_loss lovasz)
@@ -51,7 +49,7 @@ wait %2
 
 # Class weights make the networks name rare classes too often on real streets, and RV is too sure of itself.
 calibrated=$out/calibrated.safetensors
-python "$(dirname "$0")/calibrate.py" "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$calibrated" "${calibration[@]}"
+python -m amvnet.weights.calibrate "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$calibrated" "${calibration[@]}"
 
 # The head learns on streets that the networks have not seen, under stronger changes of the sensor and from
 # disturbed scores: on streets like their own the networks are too sure, and the head would rely on them.
