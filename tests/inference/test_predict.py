@@ -454,7 +454,7 @@ def test_what_a_killed_run_left_half_written_is_taken_away(
 ) -> None:
     (tmp_path / ".notes.part").write_text("a user's own file")
     with atomic_write(tmp_path / "000000.label") as part:
-        part.write_bytes(b"whole")
+        part.write_bytes(b"complete")
     part.write_bytes(b"half")  # under the name that a file has until it is whole
     Journal(tmp_path, settings_of(world)).add(Entry("000000.npz", "", "", 1, 0))
 

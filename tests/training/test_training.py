@@ -443,6 +443,7 @@ def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
 def test_broken_class_counts_are_counted_again(world: Path, run: Path, tmp_path: Path) -> None:
     contents = (run / "class_counts.npz").read_bytes()
     (tmp_path / "class_counts.npz").write_bytes(contents[:100])
+    shutil.copy(run / "run.yaml", tmp_path)
     train(world, tmp_path, "--stage", "rv", "--training.rv.epochs", 1)
     with np.load(run / "class_counts.npz") as file:
         expected = file["counts"]

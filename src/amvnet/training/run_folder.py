@@ -43,6 +43,8 @@ PACKAGES = ("amvnet", "torch", "lightning", "numpy")
 
 def is_run(out: Path) -> bool:
     """Return whether a folder is that of a run."""
+    if any((out / stage / SETTINGS).is_file() for stage in PART_OF):
+        return True
     entries = _entries(out / RECORD).values()
     return any(isinstance(entry, dict) and "versions" in entry for entry in entries)
 
@@ -95,8 +97,8 @@ def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
     entries = _entries(plan.out / RECORD)
     entries.pop(stage, None)
     entries[stage] = entry
+    write_yaml(plan.out / RECORD, entries)  # first: it says that the other files are of a run
     write_yaml(plan.out / RECIPE, to_dict(plan.recipe))
-    write_yaml(plan.out / RECORD, entries)
 
 
 def write_yaml(path: Path, tree: dict[str, Any]) -> None:
