@@ -21,9 +21,9 @@ class InputError(ValueError):
 
 
 def shown(value: object) -> str:
-    """Return a value of a file or an option for an error message: on one line, and short.
+    """Return a short text on one line that shows a value of a file or an option in a message.
 
-    Values of files may be megabytes long, or refer to themselves.
+    Values of files may be megabytes long, or contain themselves.
     """
     text = reprlib.Repr()
     text.maxlevel = 2
@@ -58,13 +58,13 @@ def _without_credentials(match: re.Match[str]) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") -> str:
-    """Return the end of an error message: the most similar name, or else what to do.
+    """Return the end of an error message: the most similar known name, or else the advice.
 
     Args:
-        advice: what to do if none is similar.
+        advice: what to do if no name is similar.
     """
     names = {name.lower(): name for name in known}
-    longest = 2 * max(map(len, names), default=0)  # nobody meant a name by a word that is longer
+    longest = 2 * max(map(len, names), default=0)  # a longer word is similar to no name
     similar = difflib.get_close_matches(word[:longest].lower(), names, n=1)
     if not similar:
         return f"; {advice}"
@@ -72,13 +72,13 @@ def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") ->
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the first line of an error's message, or the name of its class without a message."""
+    """Return the first line of an error's message; if it has none, the name of its class."""
     lines = str(error).splitlines() or [type(error).__name__]
     return lines[0]
 
 
 class SomeBroken(Exception):
-    """Some of several inputs could not be used; the others have been processed.
+    """Some inputs could not be used; all others have been processed.
 
     Attributes:
         faults: one line for each broken input.
@@ -156,7 +156,7 @@ def import_optional(module: str, extra: str) -> Any:
 
 @contextmanager
 def errors_of(source: object) -> Iterator[None]:
-    """Begin the message of an `InputError` in this block with the file that it is about."""
+    """Begin the message of every `InputError` of this block with the name of a file or option."""
     try:
         yield
     except InputError as error:
@@ -164,7 +164,7 @@ def errors_of(source: object) -> Iterator[None]:
         raise InputError(text if text.startswith(str(source)) else f"{source}: {text}") from None
 
 
-# What PyTorch, CUDA, the loader of libraries and the system say.
+# What PyTorch, CUDA, the loader of libraries and the system say if no memory is left.
 NO_MEMORY = re.compile(
     r"out of memory|(can't|cannot) allocate|failed to map segment", re.IGNORECASE
 )
@@ -172,7 +172,7 @@ NO_MEMORY = re.compile(
 
 @contextmanager
 def memory_for(content: str) -> Iterator[None]:
-    """Turn an error that says that there is no memory left into an `InputError`.
+    """Turn an error that says that no memory is left into an `InputError`.
 
     Args:
         content: what the memory is for, such as the name of a scan.

@@ -1,4 +1,4 @@
-"""Output files that appear whole or not at all, and YAML files."""
+"""Write output files that appear whole or not at all, and read YAML files."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ import yaml
 
 from amvnet.errors import InputError, shown
 
-CACHE = "AMVNET_CACHE"  # the environment variable with the folder of what can be made again
-LARGEST_YAML = 50_000  # bytes; PyYAML takes a second for as many
-DEEPEST_YAML = 50  # levels
-LONGEST_INTEGER = 40  # characters
+CACHE = "AMVNET_CACHE"  # environment variable: the folder for files that can be made again
+LARGEST_YAML = 50_000  # size of a YAML file, bytes; PyYAML takes a second for it
+DEEPEST_YAML = 50  # levels of nested values in a YAML file
+LONGEST_INTEGER = 40  # digits of a whole number in a YAML file
 INTEGER = "tag:yaml.org,2002:int"
 PARTS = f".{'[0-9a-f]' * 32}.part*"  # names of files that `atomic_write` has not finished
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # characters that names of files must not have
-# Errors of the system that another name for a file avoids.
+# Errors of the system that the user can avoid by naming another file.
 REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENAMETOOLONG)
-LONGEST_NAME = 255  # bytes, in most file systems
-LONGEST_ENDING = 20  # characters, of the names of unfinished files
+LONGEST_NAME = 255  # longest name of a file in most file systems, bytes
+LONGEST_ENDING = 20  # longest ending that an unfinished file keeps, characters
 
 unfinished: set[Path] = set()  # files and folders to remove if the process exits at once
 
@@ -36,15 +36,16 @@ unfinished: set[Path] = set()  # files and folders to remove if the process exit
 def atomic_write(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it to `path` if the block succeeds.
 
-    The temporary file lies in the same folder, which is made if necessary, and keeps the ending of
-    `path`. It is removed if the block raises. The file gets the mode of the umask, also if a
+    The temporary file lies in the same folder, which is made if necessary, and has the same ending.
+    It is removed if the block raises. The file gets the mode that the umask gives, even if a
     library writes private files.
 
-    The content is on the disk before the file has its name: a power cut leaves the old file or the
-    new one, whole. It may lose the last files on file systems that do not write folders on request,
-    and whatever is written without this function, such as the last lines of a journal.
+    The content is on the disk before the file has its name. So after a power cut there is either
+    the whole old file or the whole new file. A power cut may lose the last files on file systems
+    that do not write folders on request. It may also lose what is written without this function,
+    such as the last lines of a journal.
 
-    If the name of the file is made from data, join it to the folder by `inside`.
+    If the name of the file is made from data, join it to the folder with `inside`.
 
     Raises:
         InputError: if the folder cannot be made or the file cannot be written.
@@ -102,7 +103,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 
 
 def publish(part: Path, path: Path) -> None:
-    """Give a finished file its name, in the same file system, after its content is on the disk."""
+    """Write a finished file to the disk, then give it its name in the same file system."""
     with part.open("rb+") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
@@ -117,15 +118,15 @@ def publish(part: Path, path: Path) -> None:
 def inside(folder: Path | str, name: Path | str) -> Path:
     """Return the path of an output file whose name is made from data, such as a token of a table.
 
-    Call it each time that a file is written: what it checks may change on the disk.
+    Call this each time before a file is written, because links may appear on the disk in between.
 
     Args:
-        folder: the output folder, which may be a link itself.
+        folder: the output folder, which may itself be a link.
         name: the path of the file, relative to the folder.
 
     Raises:
-        InputError: if the file would lie outside the folder, because its name is absolute, has `..`
-            or leads through a link, or if its name has control characters or is too long.
+        InputError: if the file would lie outside the folder because its name is absolute, has `..`
+            or leads through a link; or if its name has control characters or is too long.
     """
     folder = Path(folder)
     name = Path(name)
@@ -142,7 +143,10 @@ def inside(folder: Path | str, name: Path | str) -> Path:
 
 
 def check_no_links(folder: Path) -> None:
-    """Check that no folder in an output folder, which another library fills, is a link."""
+    """Check that no folder inside an output folder is a link.
+
+    Call this before another library writes into the folder.
+    """
     for pattern in ("*", "*/*", "*/*/*"):
         for path in folder.glob(pattern):
             if path.is_dir():
@@ -157,7 +161,7 @@ def _refuse_link(path: Path) -> None:
 
 
 def _fault_of(name: Path) -> str | None:
-    """Return why no output file may have a name, relative to its folder; None if it may."""
+    """Return what is wrong with the name of an output file, relative to its folder, or None."""
     if name.anchor or ".." in name.parts or not name.name:
         return "a path that leads elsewhere"
     if CONTROL.search(str(name)):
@@ -194,7 +198,10 @@ def make_folder(path: Path) -> None:
 
 
 def user_cache() -> Path:
-    """Return where to keep what can be made again: $AMVNET_CACHE, or amvnet in the user's cache."""
+    """Return the folder for files that can be made again.
+
+    It is $AMVNET_CACHE, or else amvnet in the user's cache.
+    """
     if os.environ.get(CACHE):
         return Path(os.environ[CACHE])
     caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -205,7 +212,7 @@ def read_yaml(path: Path, content: str) -> Any:
     """Return what a YAML file holds: dictionaries, lists, texts, numbers. Nothing is executed.
 
     Args:
-        content: what the file should hold, for messages, such as "a label map".
+        content: what the file should hold, such as "a label map"; messages state it.
 
     Raises:
         InputError: if the file cannot be read, is too large, or is not YAML.
@@ -239,10 +246,11 @@ def parse_yaml(text: str, expected: str) -> Any:
 
 
 class _BoundedLoader(yaml.SafeLoader):
-    """PyYAML's safe loader without what can take hours or any amount of memory.
+    """PyYAML's safe loader without features that can take hours or any amount of memory.
 
-    Values have a limited depth, numbers have a limited length, and there are no aliases: ten lines
-    of them stand for billions of values. A key stands once: of two, one would be lost.
+    The depth of values and the length of numbers are limited. Aliases are refused, because ten
+    lines of them can stand for billions of values. A key may not stand twice, because one value
+    would be lost.
     """
 
     def __init__(self, stream: str) -> None:
@@ -262,7 +270,8 @@ class _BoundedLoader(yaml.SafeLoader):
         return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        mapping = super().construct_mapping(node, deep)  # first: it checks the kinds of the nodes
+        # PyYAML checks the kinds of the nodes, so it comes first.
+        mapping = super().construct_mapping(node, deep)
         keys = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)

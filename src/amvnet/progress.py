@@ -1,18 +1,18 @@
-"""How a long computation reports: its progress, and what it has to say in lines."""
+"""Report the progress of a long computation, and lines about it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 
-Progress = Callable[[int, int], None]  # takes what is done, and the total
-Say = Callable[[str], None]  # takes a line
+Progress = Callable[[int, int], None]  # takes the number of things done, and their total
+Say = Callable[[str], None]  # takes a line to print
 
-QUIET_SECONDS = 20  # at the beginning, without lines
+QUIET_SECONDS = 20  # time from the start in which no line is due, seconds
 
 
 class Tenths:
-    """Decides when a line about progress is due: ten times at most, and not at the beginning."""
+    """Decides when a line about progress is due: at most ten times, and not at the beginning."""
 
     def __init__(self) -> None:
         self._start = time.monotonic()
@@ -28,7 +28,11 @@ class Tenths:
 
 
 def counted(count: int, noun: str, plural: str = "") -> str:
-    """Return a number of things in words: "1 scan", "2 scans"; `plural` if it is not regular."""
+    """Return a number of things in words, such as "1 scan" or "2 scans".
+
+    Args:
+        plural: the plural of the noun if it is not regular.
+    """
     return f"{count} {noun}" if count == 1 else f"{count} {plural or f'{noun}s'}"
 
 

@@ -1,4 +1,4 @@
-"""Maps of classes to a few coarse ones, or to a user's own (docs/own_data.md)."""
+"""Map classes to a few coarse classes, or to a user's own classes (docs/own_data.md)."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ COARSE_NAME = "coarse"
 
 @dataclass(frozen=True)
 class ClassMap:
-    """A map of the classes of any taxonomy, by their names, to those of another.
+    """A map from the classes of any taxonomy, by their names, to the classes of another taxonomy.
 
     Attributes:
         target: the classes of the result.
-        sources: train ids in `target`, by the name of a class.
+        sources: the train id in `target` by the name of the class that becomes it.
     """
 
     target: Taxonomy
     sources: Mapping[str, int]
 
     def table(self, taxonomy: Taxonomy) -> np.ndarray:
-        """Return the (K + 1,) uint8 train ids in `target`, indexed by those of a taxonomy.
+        """Return the train ids in `target`, (K + 1,) uint8, indexed by a taxonomy's train ids.
 
-        A class that the map does not name becomes the target class of the same name, or is ignored
-        (0) if there is none.
+        A class that the map does not name becomes the target class of the same name. If there is no
+        such class, it is ignored (0).
 
         Raises:
             InputError: if the map names none of the classes.
@@ -52,7 +52,7 @@ class ClassMap:
 
 
 def class_map(name: str) -> ClassMap:
-    """Return the map `coarse` or the one in a YAML file; raise InputError if there is none."""
+    """Return the map `coarse` or the map in a YAML file; raise InputError if there is none."""
     if name == COARSE_NAME:
         text = (resources.files("amvnet.data") / "coarse.yaml").read_text(encoding="utf-8")
         return _parse(name, parse_yaml(text, name))

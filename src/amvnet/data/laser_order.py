@@ -1,4 +1,4 @@
-"""The laser of each point, from the order of the points in a file."""
+"""Find the laser of each point from the order of the points in a file."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from amvnet.scan import Scan
 
-SPREAD = 0.035  # about 2 degrees, as a slope: the mean deviation of one laser's slopes is below
-MIN_POINTS = 64  # per laser, on average; fewer do not show an order
+SPREAD = 0.035  # largest mean deviation of one laser's slopes; about 2 degrees
+MIN_POINTS = 64  # least mean number of points of a laser; fewer do not show an order
 
 
 def with_lasers(scan: Scan, lasers: int) -> Scan:
     """Return a scan with rings, if it has none and `lasers_by_order` finds them.
 
     Args:
-        lasers: number of lasers of the sensor; 0 looks for none.
+        lasers: number of lasers of the sensor. If it is 0, the scan is returned unchanged.
     """
     if not lasers or scan.ring is not None:
         return scan
@@ -25,15 +25,15 @@ def with_lasers(scan: Scan, lasers: int) -> Scan:
 
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
 def lasers_by_order(points: np.ndarray, lasers: int) -> np.ndarray | None:
-    """Return the (N,) laser of each point (0 = lowest), or None if the order does not show it.
+    """Return the laser of each point, (N,), 0 the lowest; None if the order does not show it.
 
     KITTI's files hold one laser after the other, from the highest to the lowest. Each laser begins
-    at the front (+x) and turns to the left, so that the azimuth passes the front from right to left
-    where the next laser begins. The order counts only if it gives exactly as many lasers as the
-    sensor has, and each laser keeps to one elevation, below the laser before it.
+    at the front (+x) and turns to the left. So the next laser begins where the azimuth passes the
+    front from right to left. The order counts only if it gives exactly as many lasers as the sensor
+    has, and each laser keeps to one elevation, below the laser before it.
 
     Args:
-        points: (N, 3 or more) x, y, z in metres, as in the file.
+        points: (N, 3 or more) x, y, z in metres, in the order of the file.
         lasers: number of lasers of the sensor.
     """
     if len(points) < MIN_POINTS * lasers:

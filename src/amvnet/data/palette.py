@@ -1,7 +1,7 @@
-"""The colours of all drawings: of the classes, and of points that are marked.
+"""The colours of all drawings: colours of the classes and of marked points.
 
-Label files carry the official colours, some of which cannot be told apart, or not from a dark
-background, in a picture.
+Label files carry the official colours. In a picture, some of these look alike, or cannot be seen on
+a dark background.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from amvnet.data.taxonomy import Color, Taxonomy
 WRONG: Color = (255, 64, 54)
 UNCERTAIN: Color = (255, 150, 180)  # unlike the colours of all classes of both benchmarks
 
-# What is drawn instead of official colours that look like those of other classes.
+# Colours that are drawn instead of official colours that look like the colours of other classes.
 DRAWN: dict[str, dict[str, Color]] = {
     "semantickitti": {
         "sidewalk": (150, 90, 150),

@@ -1,4 +1,4 @@
-"""Choose a few of many scans."""
+"""Choose a few items of many."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ Item = TypeVar("Item")
 
 
 def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:
-    """Return at most `most` of the items, evenly spaced, with the first and the last among them.
+    """Return at most `most` of the items, evenly spaced, including the first and the last.
 
-    Of fewer items, return all; if `most` is 1, return the first.
+    If there are fewer items, return all. If `most` is 1, return the first.
     """
     indices = np.linspace(0, len(items) - 1, min(most, len(items))).astype(int)
     return [items[index] for index in indices]

@@ -21,12 +21,12 @@ from amvnet.errors import InputError, one_line_errors, shown
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
 MOST_CLASSES = 255  # train ids are uint8
-# The colours of a user's classes that have none: each hue is far from all earlier ones.
+# A user's class without a colour gets one whose hue is far from all earlier hues.
 SATURATION = 0.65
 VALUE = 0.95
-GOLDEN_ANGLE = 0.381966  # of the circle of hues
-SHOWN = 5  # unknown ids in a message
-UNKNOWN = -1  # in lookup tables: no train id belongs to this raw id
+GOLDEN_ANGLE = 0.381966  # step from one hue to the next, as a share of the circle of hues
+SHOWN = 5  # most unknown ids or names that an error message lists
+UNKNOWN = -1  # marks raw ids without a train id in lookup tables
 
 Color = tuple[int, int, int]  # RGB in 0..255
 
@@ -36,17 +36,17 @@ class Taxonomy:
     """The classes of one benchmark and how its files number them.
 
     Attributes:
-        name: "semantickitti", "nuscenes" or the user's own name.
+        name: "semantickitti", "nuscenes", or a name that the user chose.
         classes: K names in the official order; `classes[0]` has train id 1.
         colors: K + 1 RGB triples in 0..255, indexed by train id (0 = ignored).
-        raw_to_train: raw id (int) -> train id, or category name (str) -> train id if the dataset
-            numbers its categories in a table of its own (nuScenes).
-        train_to_raw: K + 1 raw ids, indexed by train id: what prediction files hold.
+        raw_to_train: train ids by raw id (int). If the dataset numbers its categories in a table of
+            its own (nuScenes), train ids by category name (str).
+        train_to_raw: K + 1 raw ids of prediction files, indexed by train id.
         splits: official sequences of "train", "val" and "test"; empty if the dataset's reader
             defines them.
-        counts_absent: whether a class in neither ground truth nor prediction counts as 0 in the
-            mIoU (SemanticKITTI) or is left out of it (nuScenes).
-        ignores_rest: whether labels may have other raw ids, which are ignored.
+        counts_absent: whether a class that is in neither the ground truth nor the prediction counts
+            as 0 in the mIoU (SemanticKITTI). If not, it is left out of the mIoU (nuScenes).
+        ignores_rest: whether labels may have other raw ids; these are ignored.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Taxonomy:
         others = 0 if self.ignores_rest else UNKNOWN
         table = np.full(INSTANCE_MASK + 1, others, dtype=np.int16)
 
-        # If categories have names, the only numeric raw ids are those of prediction files.
+        # If raw ids are names of categories, only prediction files have numeric raw ids.
         if any(isinstance(raw, str) for raw in self.raw_to_train):
             table[list(self.train_to_raw)] = np.arange(self.size + 1)
 
@@ -120,7 +120,7 @@ class Taxonomy:
         return table
 
     def to_train(self, raw: np.ndarray) -> np.ndarray:
-        """Return the (N,) uint8 train ids of (N,) raw ids; only their lower 16 bits count.
+        """Return the train ids (N,) uint8 of raw ids (N,); only their lower 16 bits count.
 
         Raises:
             InputError: if a raw id is not in the table.
@@ -146,7 +146,7 @@ class Taxonomy:
         return train_ids.astype(np.uint8)
 
     def to_raw(self, ids: np.ndarray) -> np.ndarray:
-        """Return the (N,) uint32 raw ids of (N,) train ids; raise InputError if one is wrong."""
+        """Return the raw ids (N,) uint32 of train ids (N,); raise InputError if one is wrong."""
         ids = np.asarray(ids)
         if ids.size and (ids.min() < 0 or ids.max() > self.size):
             raise InputError(
@@ -157,9 +157,10 @@ class Taxonomy:
         return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON, with `raw_to_train` as pairs: keys in JSON are texts.
+        """Return the fields for JSON.
 
-        `ignores_rest` says how labels are read, and is left out.
+        `raw_to_train` becomes pairs, because keys in JSON are texts. `ignores_rest` is left out: it
+        only says how labels are read.
         """
         fields = {**dataclasses.asdict(self), "raw_to_train": list(self.raw_to_train.items())}
         del fields["ignores_rest"]
@@ -167,7 +168,7 @@ class Taxonomy:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Taxonomy:
-        """Return the taxonomy from what `to_dict` returned; raise InputError if it is wrong."""
+        """Return the taxonomy that `to_dict` wrote; raise InputError if its fields are wrong."""
 
         def message(error: BaseException) -> str:
             return (
@@ -193,7 +194,7 @@ def describe_difference(classes: Sequence[str], others: Sequence[str], of_others
     """Return in words how some classes differ from others, by their names.
 
     Args:
-        of_others: what the others belong to, such as "the weights".
+        of_others: whose classes the others are, such as "the weights".
     """
     missing = [name for name in classes if name not in others]
     added = [name for name in others if name not in classes]
@@ -206,12 +207,12 @@ def describe_difference(classes: Sequence[str], others: Sequence[str], of_others
 
 
 def class_entries(classes: Any, key: str, example: str) -> dict[str, dict[str, Any]]:
-    """Return the entries of a user's classes, by name, each as a mapping with a colour.
+    """Return the entries of a user's classes by name, each as a mapping with a colour.
 
     Args:
-        classes: the entries in a YAML file: mappings, or only the value of `key`.
+        classes: the entries in a YAML file. An entry is a mapping, or only the value of `key`.
         key: the key that every class must have.
-        example: an entry, for the message.
+        example: an entry that error messages show.
 
     Raises:
         InputError: if there are no classes, a name is not a text, or a colour is not a list of
@@ -252,7 +253,7 @@ def user_taxonomy(
     raw_to_train: Mapping[int | str, int],
     train_to_raw: Sequence[int],
 ) -> Taxonomy:
-    """Return the taxonomy of a user's classes, given the entries of `class_entries`."""
+    """Return the taxonomy of a user's classes, given what `class_entries` returned."""
     return Taxonomy(
         name=f"own-{name}" if name in TAXONOMIES else name,
         classes=tuple(entries),

@@ -25,8 +25,8 @@ from amvnet.scan import Scan, check_scan
 BINS = 100  # number of equal bins of the cosine similarity, which lies in [0, 1]
 SWEPT = 98  # number of bins that the head classifies at the largest tau, 0.98
 
-# AMVNet with one value of a parameter: the value, and in percent the uncertain points, the mIoU and
-# the accuracy.
+# AMVNet's figures for one value of a parameter: the value; the share of uncertain points, the mIoU
+# and the accuracy, in percent.
 SweptRow = tuple[float, float, float, float]
 
 
@@ -35,8 +35,9 @@ class Analysis:
     """Counts over some scans.
 
     Attributes:
-        evaluation: of every method that the weights have, the three ensembles included.
-        tau: of the weights.
+        evaluation: the evaluation of every method that the weights have, including the three
+            ensembles.
+        tau: the threshold of the weights.
         points: (BINS,) numbers of points by similarity, labelled or not.
         ensemble: (BINS, K + 1, K + 1) confusion matrices of the geometric mean, by similarity.
         head: (SWEPT, K + 1, K + 1) confusion matrices of the point head, by similarity.
@@ -56,7 +57,7 @@ class Analysis:
         self.head += other.head
 
     def sweep(self) -> list[SweptRow]:
-        """Return AMVNet's figures for each tau from 0 to 0.98, with the head as it is."""
+        """Return AMVNet's figures for each tau from 0 to 0.98. The head is not trained again."""
         sweep = []
         for bins in range(SWEPT + 1):
             matrix = self.head[:bins].sum(axis=0) + self.ensemble[bins:].sum(axis=0)
@@ -66,7 +67,7 @@ class Analysis:
 
 
 def swept_row(value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxonomy) -> SweptRow:
-    """Return the row of a value, given the share of uncertain points and a confusion matrix."""
+    """Return the row of one value, given the share of uncertain points and a confusion matrix."""
     figures = metrics(matrix, taxonomy)
     return value, 100 * uncertain, 100 * (figures["miou"] or 0), 100 * (figures["accuracy"] or 0)
 
@@ -77,7 +78,7 @@ def analyze(
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> Analysis:
-    """Score labelled scans by every method, and by the head wherever some tau asks for it.
+    """Score labelled scans by every method, and by the head on all points that some tau selects.
 
     Raises:
         InputError: if the weights lack a part, or a scan has no ground truth.
@@ -108,7 +109,7 @@ def analyze(
 
 @torch.inference_mode()
 def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> Analysis:
-    """Score a scan by every method, and by the head wherever some tau asks for it."""
+    """Score a scan by every method, and by the head on all points that some tau selects."""
 
     batch = segmenter.batch([scan])
     scores = segmenter.engine.score(batch)
@@ -117,7 +118,7 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
     assert f is not None
     assert g is not None
 
-    # Every method's labels, and the head's wherever some tau asks for it.
+    # Compute every method's labels, and the head's labels of all points that some tau selects.
     ids = {"rv": expand_labels(f, scan.valid), "bev": expand_labels(g, scan.valid)}
     for name, method in METHODS.items():
         if method.ensemble is not None:
@@ -148,11 +149,11 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
 
 
 def _bins(f: Tensor, g: Tensor) -> Tensor:
-    """Return the (P,) bins of the similarities: bin b holds those in (b, b + 1] / BINS."""
+    """Return the bins (P,) of the similarities. Bin b holds similarities in (b, b + 1] / BINS."""
     return (cosine_similarity(f, g) * BINS).ceil().long().clamp(1, BINS) - 1
 
 
 def _confusions(bins: np.ndarray, truth: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
-    """Return the (BINS, size, size) confusion matrices of the points of each bin."""
+    """Return the confusion matrix of the points in each bin, (BINS, size, size)."""
     cells = (bins * size + truth) * size + ids
     return np.bincount(cells, minlength=BINS * size * size).reshape(BINS, size, size)

@@ -1,4 +1,4 @@
-"""The figures (PNG) and tables of the paper's section 4.4, with all numbers as CSV."""
+"""Write the figures (PNG) and tables of the paper's section 4.4, and all their numbers (CSV)."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from amvnet.outputs import Signature
 SIZE = (6.0, 3.6)  # inches
 DOTS_PER_INCH = 160
 MOST_MARKED = 20  # longer sweeps are drawn without markers, which would overlap
-Cell = str | float | int | None  # None: no such number
+Cell = str | float | int | None  # a cell of a table; None if there is no such number
 
 
-# Styles of the methods' curves, in Matplotlib.
+# Matplotlib's styles for the methods' curves.
 STYLES = {
     "rv": {"marker": "o", "linestyle": ":"},
     "bev": {"marker": "s", "linestyle": "--"},
@@ -61,7 +61,7 @@ def write_sweep(
 
     Args:
         used: the parameter's value in the weights.
-        path: the files to write, without an ending.
+        path: the path of the files to write, without an ending.
     """
     values, shares, mious, _ = zip(*rows, strict=True)
 
@@ -87,7 +87,7 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
     Args:
         rows: for each network, whether it has the GRU, whether it was trained with class weights,
             and its metrics.
-        path: the files to write, without an ending.
+        path: the path of the files to write, without an ending.
     """
     table: list[Sequence[Cell]] = []
     for gru, weighted, network_metrics in rows:
@@ -119,7 +119,7 @@ def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path
 
 
 def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
-    """Draw Figure 6 of the paper: mIoU of the classes present, by distance."""
+    """Draw Figure 6 of the paper: the mIoU by distance, over the classes that are present."""
     methods = analysis.evaluation.report(dataset)["methods"]
     table: list[list[Cell]] = []
     middles = []

@@ -14,7 +14,7 @@ from amvnet.errors import InputError
 from amvnet.outputs import Signature
 
 REPORT = Signature("figures of evaluate", rb'\{\s*"dataset": ')
-# Metres; the distances of SemanticKITTI's evaluation by distance.
+# Edges of the bins in SemanticKITTI's evaluation by distance, metres.
 EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
 
 # Titles of the figures over all classes, in the order of tables.
@@ -65,19 +65,19 @@ def _check_ids(ids: np.ndarray, kind: str, size: int) -> None:
 def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
     """Apply the benchmark's formulas to a confusion matrix.
 
-    Points without a true class (row 0) never count. A labelled point whose predicted id
-    is 0 (column 0) counts as missed for its class, but does not enter the accuracy, as in
-    SemanticKITTI's tool; nuScenes' tool does not allow such predictions.
+    Points without a true class (row 0) never count. A labelled point whose predicted id is 0
+    (column 0) counts as missed for its class, but does not count in the accuracy, as in
+    SemanticKITTI's tool. nuScenes' tool does not allow such predictions.
 
     Args:
         matrix: (K + 1, K + 1) counts, truth by prediction.
-        taxonomy: the classes; its `counts_absent` says whether a class that is neither in the
-            truth nor predicted enters the mIoU, with an IoU of 0.
+        taxonomy: the classes. Its `counts_absent` says whether a class that is neither in the truth
+            nor predicted counts in the mIoU, with an IoU of 0.
 
     Returns:
-        Fractions, or None if no point counts: "miou" (official), "miou_present" (over the
-        classes in the truth), "accuracy", "fwiou" (IoU weighted by the frequency in the truth)
-        and "iou", a dictionary of each class's IoU by name.
+        Fractions, each None if no point counts: "miou" (official), "miou_present" (the mIoU over
+        the classes in the truth), "accuracy", "fwiou" (the IoU weighted by the frequency in the
+        truth); and "iou", a dictionary of each class's IoU by name.
     """
     labelled = matrix[1:].astype(np.float64)  # (K, K + 1)
     correct = np.diagonal(labelled[:, 1:])
@@ -112,9 +112,9 @@ class Evaluation:
 
     Attributes:
         taxonomy: the classes.
-        matrices: (bins + 1, K + 1, K + 1) counts by method: first of all points, then of the points
-            between each two `EDGES`. Points exactly on an edge are in no bin, as in SemanticKITTI's
-            tool.
+        matrices: (bins + 1, K + 1, K + 1) counts by method. The first matrix counts all points, the
+            others the points between two `EDGES`. Points exactly on an edge are in no bin, as in
+            SemanticKITTI's tool.
         scans: number of scans that were added.
         points: number of points in these scans, labelled or not.
         uncertain: number of uncertain points.
@@ -144,7 +144,7 @@ class Evaluation:
             uncertain: (N,) bool, or None if it is not known which points are uncertain.
 
         Raises:
-            InputError: as `confusion`; the scan is then not counted at all.
+            InputError: if `confusion` raises it; the scan is then not counted at all.
         """
         size = self.taxonomy.size
         distances = np.linalg.norm(points[:, :3], axis=1)
@@ -165,7 +165,7 @@ class Evaluation:
             self.asked += len(uncertain)
 
     def __add__(self, other: Evaluation) -> Evaluation:
-        """Return an evaluation of the scans of both, which have the same classes."""
+        """Return the evaluation of the scans of both; both must have the same classes."""
         total = Evaluation(self.taxonomy)
         for part in (self, other):
             total._add_counts(part.matrices)
@@ -176,7 +176,7 @@ class Evaluation:
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
-        """Return all metrics of a dataset, of all points and by distance, as JSON types."""
+        """Return all metrics of a dataset, over all points and by distance, for JSON."""
         methods = {}
         for method, matrices in self.matrices.items():
             bins = []

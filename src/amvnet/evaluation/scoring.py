@@ -33,10 +33,10 @@ from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan, check_scan
 
 Result = TypeVar("Result")
-# (N,) train ids by method, and (N,) bool: the uncertain points; None without two networks.
+# Train ids (N,) by method; and (N,) bool, the uncertain points, or None without two networks.
 MethodLabels = tuple[dict[str, np.ndarray], np.ndarray | None]
 
-PICTURES = 4  # scans that are drawn, evenly spaced
+PICTURES = 4  # number of scans that are drawn, evenly spaced
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Labeller:
     Attributes:
         label: labels a scan by one or several methods.
         taxonomy: the classes of the labels.
-        classes: maps the classes of the labels and of the data to those that are scored; None if
-            all are the same.
+        classes: maps the labels' classes and the data's classes to the classes that are scored;
+            None if all these are the same.
         at_once: number of scans that it labels at the same time, each in a thread.
     """
 
@@ -57,7 +57,7 @@ class Labeller:
     at_once: int = 1
 
     def table(self, taxonomy: Taxonomy) -> np.ndarray:
-        """Return the (K + 1,) uint8 train ids to score, indexed by those of a taxonomy."""
+        """Return the train ids to score, (K + 1,) uint8, indexed by a taxonomy's train ids."""
         if self.classes is None:
             return np.arange(taxonomy.size + 1, dtype=np.uint8)
         return self.classes.table(taxonomy)
@@ -74,12 +74,12 @@ def evaluate(
     """Score the labels of some scans.
 
     Args:
-        pictures: folder for pictures of a few of the scans from above; None draws none.
+        pictures: folder for pictures of a few scans from above; by default none are drawn.
         progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans; each returns the evaluation of all scans.
 
     Raises:
-        InputError: if the labels do not have the dataset's classes, or a scan has no ground truth.
+        InputError: if the labels do not have the dataset's classes, or a scan has no true labels.
     """
     taxonomy = dataset.taxonomy if labeller.classes is None else labeller.classes.target
     if labeller.classes is None:
@@ -131,7 +131,7 @@ def stream_labelled(
     at_once: int,
     progress: Progress,
 ) -> Iterator[Result]:
-    """Yield results as `stream_scans` does; raise InputError if a scan has no ground truth."""
+    """Yield results as `stream_scans` does; raise InputError if a scan has no true labels."""
 
     def read(record: ScanRecord) -> Scan:
         scan = dataset.read(record)
@@ -150,7 +150,7 @@ def label_by_weights(
     methods: Sequence[str] = PAPER_METHODS,
     classes: ClassMap | None = None,
 ) -> Labeller:
-    """Return a labeller that runs some weights by several methods."""
+    """Return a labeller that labels scans with some weights, by several methods."""
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
         return labels_by_method(segmenter, check_scan(scan), methods)
@@ -163,8 +163,8 @@ def labels_by_method(
 ) -> MethodLabels:
     """Label the N points of a scan by a segmenter's method and by the methods that it includes.
 
-    AMVNet and the ensembles include all ensembles and each network alone. Those of `methods` that
-    are not included are left out. The networks run once.
+    AMVNet and the ensembles include all ensembles and each network alone. Other `methods` are left
+    out. The networks run only once.
     """
     batch = segmenter.batch([scan])
     scores = segmenter.engine.score(batch)
@@ -201,7 +201,11 @@ def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatc
 
 
 def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = None) -> Labeller:
-    """Return a labeller that reads predictions; raise InputError if there is no such folder."""
+    """Return a labeller that reads predictions from a folder.
+
+    Raises:
+        InputError: if there is no such folder.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 

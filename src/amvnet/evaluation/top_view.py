@@ -1,4 +1,4 @@
-"""A scan from above: truth, predictions, errors and uncertain points in one PNG."""
+"""Draw a scan from above: truth, predictions, errors and uncertain points in one PNG."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from amvnet.data.taxonomy import Color, Taxonomy
 from amvnet.files import atomic_write
 from amvnet.outputs import Signature
 
-REACH = 50.0  # metres shown on each side of the sensor
-PANEL = 4.6  # inches, width and height of one panel
+REACH = 50.0  # distance shown on each side of the sensor, metres
+PANEL = 4.6  # width and height of a panel, inches
 DOTS_PER_INCH = 130
-ENTRIES = 3  # legend entries in a line, for each column of panels
-LEGEND_LINE = 0.2  # inches, height of one line of the legend
-LEGEND_MARGIN = 0.5  # inches
-DOT = 1.1  # area of a point in square typographic points
+ENTRIES = 3  # number of legend entries in a line, for each column of panels
+LEGEND_LINE = 0.2  # height of a line of the legend, inches
+LEGEND_MARGIN = 0.5  # margin of the legend, inches
+DOT = 1.1  # area of a drawn point, square typographic points
 
 PICTURE = Signature("a picture by Matplotlib", rb"\x89PNG.*Matplotlib")
 IGNORED: Color = (204, 204, 204)
-PLAIN = (0.75, 0.75, 0.75)  # RGB in [0, 1]
+PLAIN = (0.75, 0.75, 0.75)  # colour of points that are not marked, RGB in [0, 1]
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class _Panel:
     """One view of the scan.
 
     Attributes:
-        title: the line above it.
+        title: the line above the panel.
         colors: (N, 3) RGB in [0, 1].
         on_top: (N,) bool, the points that are drawn over all others.
     """
@@ -54,7 +54,7 @@ class TopView:
         predictions: (N,) train ids by title.
         truth: (N,) train ids of the ground truth.
         title: a line above all panels.
-        uncertain: (N,) bool, or None.
+        uncertain: (N,) bool, the uncertain points; None if they are unknown.
     """
 
     points: np.ndarray
@@ -68,10 +68,9 @@ class TopView:
 def draw_scan(path: Path, view: TopView) -> Path:
     """Draw one scan from above, x to the right and y up, 50 m to each side; return the path.
 
-    The first row shows the truth and each prediction. Below each prediction are its errors
-    (correct in grey, wrong in red; ignored points count as neither), below the truth the
-    uncertain points. The legend has the classes that appear. The PNG appears whole or not at
-    all.
+    The first row shows the truth and each prediction. Below each prediction are its errors: correct
+    points in grey, wrong points in red; ignored points are neither. Below the truth are the
+    uncertain points. The legend has the classes that appear. The PNG appears whole or not at all.
     """
     from matplotlib.figure import Figure
 
@@ -95,9 +94,9 @@ def draw_scan(path: Path, view: TopView) -> Path:
 
 
 def _grid(view: TopView) -> list[list[_Panel | None]]:
-    """Return the rows of panels; None leaves a cell of the grid empty.
+    """Return the rows of panels. Cells of the grid that are None stay empty.
 
-    The truth has the first column, and each prediction a column of its own.
+    The first column shows the truth, and each other column a prediction.
     """
     palette = np.asarray([IGNORED, *class_colors(view.taxonomy)[1:]]) / 255.0
     labelled = view.truth > 0
@@ -118,7 +117,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
 def _highlight(title: str, mask: np.ndarray, total: int, color: Color) -> _Panel:
     """Return a panel with the points of a mask in one colour and all others in grey.
 
-    The title also gives the number of these points as a share of `total`.
+    The title also states the number of points in the mask as a share of `total`.
     """
     share = np.count_nonzero(mask) / max(total, 1)
     colors = np.where(mask[:, None], np.divide(color, 255), PLAIN)
@@ -126,7 +125,7 @@ def _highlight(title: str, mask: np.ndarray, total: int, color: Color) -> _Panel
 
 
 def _legend_entries(view: TopView) -> list[tuple[str, Color]]:
-    """Return (name, colour) of the classes that appear, and of wrong and uncertain points."""
+    """Return names and colours of the classes that appear, and of wrong and uncertain points."""
     class_ids = np.unique([view.truth, *view.predictions.values()]).tolist()
 
     colors = class_colors(view.taxonomy)

@@ -1,1 +1,1 @@
-"""Labels that may be wrong, the most doubtful first."""
+"""Rank labels that may be wrong, the most doubtful first."""

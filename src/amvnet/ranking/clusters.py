@@ -1,4 +1,4 @@
-"""Cluster points: a cluster is a set of points of one kind that are connected."""
+"""Divide points into clusters. A cluster is a set of connected points of one kind."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-CELL = 0.4  # metres: side of a cell; points of the same cell or of touching cells are connected
-# Distances in cells: cells that touch, if only at a corner, are at most sqrt(3) apart, others at
-# least 2. Points of different kinds count as farther apart.
-TOUCHING = 1.75
-APART = 4.0
+CELL = 0.4  # side of a cell, metres; points in the same cell or in touching cells are connected
+# Cells that touch, even if only at a corner, are at most sqrt(3) cells apart; others at least 2.
+TOUCHING = 1.75  # largest distance of touching cells, cells
+APART = 4.0  # least distance of cells of different kinds, cells
 
 
 def cluster(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """Return the (N,) int64 cluster of each point, numbered from 0.
+    """Return the cluster of each point, (N,) int64, numbered from 0.
 
     Args:
         xyz: (N, 3) metres.
@@ -24,7 +23,7 @@ def cluster(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
     if not len(xyz):
         return np.zeros(0, dtype=np.int64)
 
-    # Cells have the kind as a fourth coordinate, in which different kinds never touch.
+    # The kind is a fourth coordinate of a cell, so that cells of different kinds never touch.
     cell_of_point = np.column_stack([np.floor(xyz / CELL), kind]).astype(np.int64)
     cells, cell_index = np.unique(cell_of_point, axis=0, return_inverse=True)
     tree = cKDTree(cells * [1, 1, 1, APART])

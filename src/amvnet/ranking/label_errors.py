@@ -1,6 +1,6 @@
-"""Rank points that may be labelled wrongly, because both views contradict their labels.
+"""Rank points whose labels may be wrong, because both views contradict them.
 
-The points are grouped into clusters, and the most doubtful clusters come first.
+The points are divided into clusters. The most doubtful clusters come first.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan, check_scan
 
-NEAR = 1.5  # metres: points nearer to the sensor belong to its vehicle and are never doubted
-# Points with doubt 0 that count as part of each cluster for its mean doubt, so that clusters of a
+NEAR = 1.5  # metres; nearer points belong to the sensor's vehicle and are never doubted
+# A cluster's mean doubt includes this many additional points with doubt 0, so that clusters of a
 # few stray points do not rank first.
 FEW = 20.0
-# Scores are divided by the number of clusters of the same kind, raised to this power: a
-# contradiction that occurs often is more likely a mistake of the views than of the labels.
+# A score is divided by the number of clusters of the same kind, raised to this power. If a
+# contradiction occurs often, more likely the views are wrong than the labels.
 COMMON = 0.5
 
 COLUMNS = ("rank", "scan", "score", "x", "y", "z", "points", "point", "rv", "bev", "label")
 TABLE = Signature("a table of rank", ",".join(COLUMNS).encode())
 
-# One cluster. Its middle point is the one nearest to the mean of its points.
+# One cluster. The middle point of a cluster is the point nearest to the mean of its points.
 ROW = np.dtype(
     [
-        ("scan", np.int32),  # index of the scan among those that are ranked
+        ("scan", np.int32),  # index of the scan among the ranked scans
         ("score", np.float32),
-        ("xyz", np.float32, 3),  # metres, of the middle point
+        ("xyz", np.float32, 3),  # position of the middle point, metres
         ("points", np.int32),  # number of points
         ("point", np.int32),  # index of the middle point in the scan
         ("rv", np.uint8),  # most common train id predicted by the range view
         ("bev", np.uint8),  # most common train id predicted by the bird's-eye view
         ("label", np.uint8),  # train id of the middle point's label
-        ("kind", np.int32),  # as in `Doubts`
+        ("kind", np.int32),  # `Doubts.kind` of its points
     ]
 )
 
@@ -63,9 +63,9 @@ class Doubts:
         rv: (N,) train ids predicted by the range view.
         bev: (N,) train ids predicted by the bird's-eye view.
         label: (N,) train ids of the labels.
-        kind: (N,) the label and the class that both views agree on, as one number. All points of
-            a cluster have the same kind.
-        whole: (N,) number of points in the labelled thing that the point is a part of.
+        kind: (N,) one number for the label and the class that both views agree on. All points of a
+            cluster have the same kind.
+        whole: (N,) number of points of the labelled thing to which the point belongs.
     """
 
     xyz: np.ndarray
@@ -134,7 +134,7 @@ def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
 
     contradiction, agreed_ids = _contradiction(f, g, torch.from_numpy(label[valid]))
     doubt = expand_to_scan(contradiction * off_vehicle, valid)
-    # One number for each pair of train ids.
+    # Each pair of train ids becomes one number.
     kind = label.astype(np.int64) * 256 + expand_to_scan(agreed_ids, valid)
     whole = _thing_sizes(xyz, label, valid)
     return Doubts(xyz, doubt, rv=rv, bev=bev, label=label, kind=kind, whole=whole)
@@ -145,9 +145,9 @@ def _contradiction(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return how strongly both views contradict the labels, and the class they agree on.
 
-    The contradiction is the smaller of the two probabilities of the class they agree on, minus
-    the larger of the two probabilities of the label. It is 0 if the difference is negative or
-    the point has no label.
+    Each view gives a probability to the class that both agree on, and one to the label. The
+    contradiction is the smaller probability of the former minus the larger probability of the
+    latter. It is 0 if this difference is negative or the point has no label.
 
     Args:
         f: (P, K) class probabilities of the range view.
@@ -167,9 +167,10 @@ def _contradiction(
 
 
 def _thing_sizes(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return for each point the number of points in its thing, (N,).
+    """Return the number of points in the thing of each point, (N,).
 
-    A thing is a set of connected points with one label; points that are not valid count alone.
+    A thing is a set of connected points with one label. A point that is not valid is a thing of its
+    own.
     """
     things = cluster(xyz[valid], label[valid])
     sizes = np.ones(len(xyz))
@@ -178,13 +179,13 @@ def _thing_sizes(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.nd
 
 
 def find_clusters(doubts: Doubts) -> np.ndarray:
-    """Group the doubted points of one scan into (C,) clusters, rows of `ROW`."""
+    """Divide the doubted points of one scan into clusters: (C,) rows of `ROW`."""
     doubted = np.flatnonzero(doubts.doubt > 0)
     group = cluster(doubts.xyz[doubted], doubts.kind[doubted])
     sizes = np.bincount(group)
     middle = doubted[_middle_points(doubts.xyz[doubted], group, sizes)]
     total_doubt = np.bincount(group, doubts.doubt[doubted])
-    # A cluster that is a whole labelled thing counts more than one at the edge of a thing.
+    # A cluster that is a whole labelled thing counts more than a cluster at the edge of a thing.
     share = sizes / doubts.whole[middle]
 
     rows = np.zeros(len(sizes), dtype=ROW)
@@ -200,7 +201,7 @@ def find_clusters(doubts: Doubts) -> np.ndarray:
 
 
 def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the index of the point nearest to the mean of each group."""
+    """Return the index of the point nearest to the mean in each group."""
     mean = np.stack([np.bincount(group, axis) / sizes for axis in xyz.T], axis=1)
     squared_distance = ((xyz - mean[group]) ** 2).sum(axis=1)
     order = np.lexsort((squared_distance, group))
@@ -210,7 +211,7 @@ def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.
 
 
 def _most_common(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """Return the most common id in each of `count` groups, or the lowest of several."""
+    """Return the most common id in each of `count` groups; the lowest if several are."""
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
     return table.argmax(axis=1)

@@ -1,1 +1,1 @@
-"""The memory, the threads and the processes that a run takes."""
+"""The memory, the threads and the processes of a run."""

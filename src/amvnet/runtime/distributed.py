@@ -1,4 +1,4 @@
-"""Processes that share a job, started by torchrun or SLURM."""
+"""Connect processes that share a job, started by torchrun or SLURM."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# How long a process waits for the others. One may read for hours; if one dies, all of them end.
-PATIENCE = timedelta(days=7)
+# How long a process waits for the others. A process may read for hours. If one dies, all end.
+LONGEST_WAIT = timedelta(days=7)
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Processes:
     """This process among the processes of a job; by default it is the only one.
 
     Attributes:
-        rank: its number among all processes, from 0.
+        rank: this process's number among all processes, from 0.
         size: number of processes.
-        local_rank: its number among the processes on the same machine, from 0.
+        local_rank: this process's number among the processes on its machine, from 0.
         nodes: number of machines.
-        group: torch's process group for the exchange of Python objects; None if it is alone.
+        group: torch's process group for exchanging Python objects; None for a single process.
     """
 
     rank: int = 0
@@ -45,11 +45,11 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that prints, and writes what only one should write."""
+        """Whether this is the process that prints, and that writes what only one may write."""
         return self.rank == 0
 
     def share(self, items: Sequence[T]) -> Sequence[T]:
-        """Return this process's share of the items: every `size`-th, from `rank` on."""
+        """Return this process's share of the items: every `size`-th item, starting at `rank`."""
         return items[self.rank :: self.size]
 
     def gather(self, value: T) -> list[T]:
@@ -85,7 +85,7 @@ ALONE = Processes()
 
 
 def environment() -> ClusterEnvironment:
-    """Return Lightning's environment: that of torchrun, srun or neither."""
+    """Return Lightning's environment for torchrun, for srun, or for neither."""
     from lightning.fabric.plugins.environments import (
         LightningEnvironment,
         SLURMEnvironment,
@@ -103,7 +103,7 @@ def environment() -> ClusterEnvironment:
 
 
 def started() -> int:
-    """Return how many processes were started for this job, by the environment variables."""
+    """Return how many processes were started for this job, as the environment variables say."""
     if dist.is_torchelastic_launched():
         return int(os.environ.get("WORLD_SIZE", "1"))
 
@@ -111,7 +111,7 @@ def started() -> int:
 
 
 def _slurm_tasks() -> int:
-    """Return the number of tasks that srun has started; 1 in the script of a job itself."""
+    """Return the number of tasks that srun has started; 1 in the job's own script."""
     if "SLURM_STEP_ID" not in os.environ:
         return 1
 
@@ -123,7 +123,8 @@ def join(cuda: bool = False) -> Processes:
     """Connect to the other processes of this job, if there are any.
 
     Args:
-        cuda: whether they compute on CUDA devices, and exchange gradients by NCCL instead of gloo.
+        cuda: whether the processes compute on CUDA devices and exchange gradients by NCCL instead
+            of gloo.
     """
     if started() == 1:
         return ALONE
@@ -140,7 +141,7 @@ def join(cuda: bool = False) -> Processes:
     dist.init_process_group("nccl" if cuda else "gloo", rank=rank, world_size=size)
     atexit.register(dist.destroy_process_group)
 
-    group = dist.new_group(backend="gloo", timeout=PATIENCE)
+    group = dist.new_group(backend="gloo", timeout=LONGEST_WAIT)
     return Processes(
         rank=rank, size=size, local_rank=local_rank, nodes=_node_count(size), group=group
     )
@@ -156,7 +157,7 @@ def _node_count(size: int) -> int:
 
 
 def device_of(accelerator: str) -> str:
-    """Return the kind of device (cuda, mps or cpu) that an accelerator of Lightning is here.
+    """Return the kind of device (cuda, mps or cpu) of one of Lightning's accelerators.
 
     Raises:
         InputError: if this machine has no such device.

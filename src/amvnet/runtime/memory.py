@@ -1,4 +1,4 @@
-"""Keep the memory of this process from one scan to the next, and measure what there is."""
+"""Keep this process's memory from one scan to the next, and measure how much there is."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 # Options of glibc's mallopt, from malloc.h.
-M_TRIM_THRESHOLD = -1  # free bytes above which they are returned to the system
-M_MMAP_MAX = -4  # blocks that may each have a mapping of their own
-M_ARENA_MAX = -8  # heaps that the process may have
-DEFAULTS = {M_MMAP_MAX: 65536, M_TRIM_THRESHOLD: 128 * 1024}  # glibc's
+M_TRIM_THRESHOLD = -1  # number of free bytes above which they are returned to the system
+M_MMAP_MAX = -4  # most blocks that have a mapping of their own
+M_ARENA_MAX = -8  # most heaps of the process
+DEFAULTS = {M_MMAP_MAX: 65536, M_TRIM_THRESHOLD: 128 * 1024}  # glibc's default values
 
 MEMINFO = Path("/proc/meminfo")
-CONTROL_GROUP = Path("/sys/fs/cgroup")  # of this process, in a container
+CONTROL_GROUP = Path("/sys/fs/cgroup")  # this process's control group in a container
 
-_is_kept = False  # by `keep_freed_memory`
+_is_kept = False  # whether `keep_freed_memory` took effect
 
 
 def keep_freed_memory() -> bool:
     """Let this process keep the memory that it frees, instead of returning it to the system.
 
-    By default glibc requests each block over 32 MiB from the system and returns it once it is
+    By default, glibc requests each block over 32 MiB from the system, and returns it when it is
     freed. The system fills every new block with zeros, which takes time. The process keeps at most
-    what its largest scan needed. All threads share one heap, because a thread's own heap cannot
-    hold a block over 64 MiB.
+    as much memory as its largest scan needed. All threads share one heap, because a thread's own
+    heap cannot hold a block over 64 MiB.
 
     This changes the allocator of the whole process.
 
@@ -43,10 +43,10 @@ def keep_freed_memory() -> bool:
 
 @contextmanager
 def return_freed_memory() -> Iterator[None]:
-    """Return freed memory to the system within the block, also after `keep_freed_memory`.
+    """Return freed memory to the system within the block, even after `keep_freed_memory`.
 
-    Blocks of a very large scan, freed and requested in turn, leave gaps in the heap that no other
-    block fits into.
+    A very large scan frees and requests large blocks in turn. In a kept heap, this leaves gaps into
+    which no other block fits.
     """
     if not _is_kept:
         yield
@@ -70,16 +70,17 @@ def _set_options(options: Mapping[int, int]) -> bool:
 
 
 def available_memory() -> int:
-    """Return the bytes that this process can still take, of the machine or its control group.
+    """Return how much memory this process can still take, in bytes.
 
-    On systems other than Linux, half of the machine's memory stands for it.
+    This is what the machine has available, or less if the control group allows less. On systems
+    other than Linux, it is taken to be half of the machine's memory.
     """
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     available = total // 2
     with suppress(OSError, ValueError, StopIteration):
         lines = MEMINFO.read_text().splitlines()
         line = next(line for line in lines if line.startswith("MemAvailable:"))
-        available = int(line.split()[1]) * 1024  # of "MemAvailable:  123 kB"
+        available = int(line.split()[1]) * 1024  # the line reads "MemAvailable:  123 kB"
     with suppress(OSError, ValueError):  # "max" is no number
         limit = int((CONTROL_GROUP / "memory.max").read_text())
         available = min(available, limit - int((CONTROL_GROUP / "memory.current").read_text()))

@@ -1,8 +1,8 @@
-"""How this process's OpenMP threads behave while other programs run, and after a fork.
+"""Make this process's OpenMP threads behave while other programs run, and after a fork.
 
-torch divides each operation among a team of OpenMP threads. A thread of the team that is done
-waits for the others, by default by spinning: it keeps its processor busy. If another program needs
-that processor, the thread that all wait for does not get it, and a call takes many times as long.
+torch divides each operation among a team of OpenMP threads. A thread that is done waits for the
+others. By default it spins: it keeps its processor busy. If other programs also run, the thread for
+which all wait may find no free processor, and a call takes many times as long.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
-# By these variables, threads sleep while they wait. GNU's and LLVM's OpenMP read the first, LLVM's
-# and Intel's the last one. The second replaces the first for GNU's, so that it stays unset.
+# With these variables, threads sleep while they wait. GNU's and LLVM's OpenMP read the first,
+# LLVM's and Intel's the last. For GNU's, the second would override the first, so it stays unset.
 WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": None, "KMP_BLOCKTIME": "0"}
 
 Part = TypeVar("Part")
@@ -24,10 +24,10 @@ Result = TypeVar("Result")
 
 
 def wait_passively() -> None:
-    """Let the threads of this process, and of those that it starts, sleep while they wait.
+    """Let the threads of this process, and of processes that it starts, sleep while they wait.
 
-    Nothing changes if the user has set one of the variables, or torch is already imported: OpenMP
-    reads the environment only once.
+    Nothing changes if the user has set one of the variables, or if torch is already imported:
+    OpenMP reads the environment only once.
     """
     if any(name in os.environ for name in WAITING) or "torch" in sys.modules:
         return
@@ -45,10 +45,12 @@ def do_threads_sleep() -> bool:
 def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
     """Run the parts of a computation on a CPU; return their results in order.
 
-    A thread that sleeps has to be woken for its share of each operation. In a part of many short
-    operations this takes longer than the share. So every thread takes whole parts instead; if there
-    are fewer parts than threads, each part gets equally many. Threads that spin need no waking, and
-    would keep the processors from the threads of the parts.
+    torch wakes sleeping threads for their share of each operation. If operations are short, waking
+    takes longer than the share. So every thread takes whole parts instead. If there are fewer parts
+    than threads, each part gets equally many threads.
+
+    If threads spin, they need no waking, and would keep the processors from the threads that run
+    the parts. Then the parts run in turn.
     """
     import torch
 
@@ -58,7 +60,7 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     if workers < 2:
         return [run(part) for part in parts]
 
-    # All of these are settings of a thread.
+    # Each thread has its own value of these settings, so they are passed on.
     is_inference = torch.is_inference_mode_enabled()
     is_mixed = torch.is_autocast_enabled("cpu")
     precision = torch.get_autocast_dtype("cpu")
@@ -77,7 +79,7 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
 
 @contextmanager
 def thread_pool(workers: int, threads_each: int) -> Iterator[ThreadPoolExecutor]:
-    """Yield a pool of threads that compute with a number of torch's threads each."""
+    """Yield a pool of threads, each of which computes with `threads_each` of torch's threads."""
     import torch
 
     threads = torch.get_num_threads()
@@ -94,7 +96,7 @@ def thread_pool(workers: int, threads_each: int) -> Iterator[ThreadPoolExecutor]
 def survive_forks() -> None:
     """Let every process that is forked from this one compute with one thread.
 
-    The threads of the team are not part of the forked process, which would wait for them forever.
+    A forked process does not have the threads of the team, and would wait for them forever.
     """
     os.register_at_fork(after_in_child=_use_one_thread)
 

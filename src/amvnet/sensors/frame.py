@@ -13,17 +13,18 @@ from amvnet.errors import InputError
 from amvnet.sensors.ground import Ground, find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
 
-# The median distance of the points tells the unit: in metres it is 2 to 40 with all sensors.
-FARTHEST_MEDIAN = 200.0  # up to here, the unit is metres
-MIN_MILLIMETRES = 4000.0  # from here on, millimetres; in between, centimetres or millimetres
-# The origin is near the sensor if near points (5 %) are nearer than this share of far ones (95 %).
+# The median distance of the points tells the unit: with all sensors it is 2 to 40 metres.
+FARTHEST_MEDIAN = 200.0  # largest median distance for which the unit is metres
+MIN_MILLIMETRES = 4000.0  # above it, millimetres; between the two, centimetres or millimetres
+# The origin is near the sensor if the 5 % quantile of the distances is less than this share of the
+# 95 % quantile.
 AROUND = 0.5
 
-UP_AXES = ("z-down", "z-forward", "y-up")  # to try if no ground is found below
-SAME_TILT = 3.5  # degrees: roads slope by up to 3.1 as seen from the cars of the datasets
-STEADY_TILT = 3.0  # degrees: if tilts in a recording differ by more, each scan gets its own
-SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
-LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
+UP_AXES = ("z-down", "z-forward", "y-up")  # axes to try if no ground is found below
+SAME_TILT = 3.5  # largest tilt that is not levelled, degrees; the datasets' roads slope by 3.1
+STEADY_TILT = 3.0  # degrees; if tilts in a recording differ by more, each scan gets its own
+SAME_HEIGHT = 0.15  # largest difference of height that is not corrected, metres; training varies it
+LOWEST = 0.3  # metres; if the origin is lower, it lies on the ground and not at the sensor
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,13 @@ class Frame:
     """What was found out about the frame of a file, as far as the user did not describe it.
 
     Attributes:
-        unit: of the coordinates, a name in `UNITS`.
-        axes: which way they point, a name in `AXES`.
-        pitch, roll: degrees that turn the scan level, once its axes are the package's; 0 if it is
-            level enough, or the user described the rotation.
-        height: metres of the origin over the ground in the level scan; None without a ground.
-        tilt: degrees of the ground before the scan is turned level, for messages.
+        unit: the unit of the coordinates, a name in `UNITS`.
+        axes: the directions of the axes, a name in `AXES`.
+        pitch, roll: degrees by which to turn the scan level after its axes became the package's; 0
+            if the scan is level enough, or the user described the rotation.
+        height: height of the origin over the ground in the level scan, metres; None if no ground
+            was found.
+        tilt: tilt of the ground before the scan is turned level, degrees; messages state it.
     """
 
     unit: str = "m"
@@ -47,9 +49,9 @@ class Frame:
     tilt: float = 0.0
 
     def complete(self, sensor: Sensor) -> Sensor:
-        """Return the sensor with everything about its frame known.
+        """Return the sensor with this frame where the user did not describe it.
 
-        What the user described comes first; pitch and roll turn the scan about the sensor.
+        Pitch and roll turn the scan about the sensor.
         """
         if sensor.rotate is not None:
             return dataclasses.replace(sensor, unit=self.unit)
@@ -64,7 +66,7 @@ class Frame:
         return dataclasses.replace(complete, offset=(float(x), float(y), float(z)))
 
     def is_on_ground(self, sensor: Sensor) -> bool:
-        """Return whether the origin of the coordinates lies on the ground, or below."""
+        """Return whether the origin of the coordinates lies on the ground or below it."""
         may_be_higher = sensor.height is None or sensor.height >= LOWEST
         return self.height is not None and self.height < LOWEST and may_be_higher
 
@@ -72,9 +74,10 @@ class Frame:
         """Return how far to move a scan up, metres.
 
         Args:
-            sensor: what is known of it.
-            usual_height: metres over the ground of the sensor that the weights know, and of a
-                sensor of unknown height that is not at the origin; None if unknown.
+            sensor: what is known about the sensor.
+            usual_height: height over the ground of the sensor that the weights know, metres; None
+                if unknown. A sensor of unknown height that is not at the origin is assumed to have
+                this height.
 
         Returns:
             The rise that brings the sensor to the origin, and the rise that brings the ground
@@ -99,11 +102,12 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
     """Find the frame of a scan.
 
     Args:
-        xyz: (N, 3) finite coordinates as in the file, without lost points.
+        xyz: (N, 3) finite coordinates of the file, without lost points.
         sensor: what the user described; only the rest is guessed.
 
     Raises:
-        InputError: if the user did not give the unit, and it is neither metres nor millimetres.
+        InputError: if the user did not give the unit, and the coordinates are clearly neither
+            metres nor millimetres.
     """
     unit = sensor.unit or _find_unit(xyz)
     frame = Frame(unit, sensor.axes or "x-forward")
@@ -126,7 +130,7 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
 
 
 def _find_unit(xyz: np.ndarray) -> str:
-    """Tell metres from millimetres by the distances of (N, 3) points."""
+    """Tell metres from millimetres by the distances of points (N, 3)."""
     if not len(xyz):
         return "m"
     distances = np.linalg.norm(xyz.astype(np.float64), axis=1)
@@ -144,9 +148,10 @@ def _find_unit(xyz: np.ndarray) -> str:
 
 
 def _find_axes(xyz: np.ndarray) -> str:
-    """Return the axes by which the (N, 3) points have a ground, if only one of `UP_AXES` does.
+    """Return the only one of `UP_AXES` with which the points (N, 3) have a sure ground.
 
-    In a corridor, more than one does: its walls look like a ground.
+    If several have one, return "x-forward". This happens in a corridor, whose walls look like a
+    ground.
     """
     sure = []
     for axes in UP_AXES:
@@ -159,7 +164,8 @@ def _find_axes(xyz: np.ndarray) -> str:
 def _level(frame: Frame, level: np.ndarray, ground: Ground) -> Frame:
     """Return the frame with the rotation that levels a tilted scan.
 
-    The ground is found a second time in the level scan, whose cells have other lowest points.
+    The ground is then searched for again, because the cells of the level scan have other lowest
+    points.
     """
     turn = rotation_from_degrees(0, *_levelling(ground.up))
     again = find_ground(level @ turn.T) or ground
@@ -169,7 +175,7 @@ def _level(frame: Frame, level: np.ndarray, ground: Ground) -> Frame:
 
 
 def _levelling(up: np.ndarray) -> tuple[float, float]:
-    """Return pitch and roll in degrees of the rotation that turns a (3,) vector to +z."""
+    """Return pitch and roll, degrees, of the rotation that turns a vector (3,) to +z."""
     x, y, z = up
     roll = np.degrees(np.arctan2(y, z))
     pitch = -np.degrees(np.arctan2(x, np.hypot(y, z)))
@@ -177,7 +183,7 @@ def _levelling(up: np.ndarray) -> tuple[float, float]:
 
 
 def median_frame(frames: Sequence[Frame]) -> Frame:
-    """Return the frame of a recording, given those of its first scans."""
+    """Return the frame of a recording, given the frames of its first scans."""
     unit = mode(frame.unit for frame in frames)
     axes = mode(frame.axes for frame in frames)
     alike = [frame for frame in frames if (frame.unit, frame.axes) == (unit, axes)]

@@ -1,4 +1,4 @@
-"""Find the ground in a scan: the plane that most of the lowest points around the sensor lie in."""
+"""Find the ground in a scan: the plane that holds most of the lowest points around the sensor."""
 
 from __future__ import annotations
 
@@ -6,29 +6,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MIN_DISTANCE = 1.0  # metres: nearer returns are from the vehicle itself
-CELL = 1.0  # metres: side of the cells whose lowest points are used
-RADIUS = 20.0  # metres: farther points are not used
-HALF_WEIGHT = 8.0  # metres: a cell at this distance counts half as much as one at the sensor
-TRIES = 400  # planes through three low points each
-MIN_AREA = 1.0  # square metres: twice the area of the triangle between the three points
-TOLERANCE = 0.1  # metres between the plane and the points of the ground
-MAX_SLOPE = 25.0  # degrees: steeper planes are walls and embankments
-MIN_CELLS = 30
-MIN_AGREEMENT = 0.25  # weighted share of the cells that must lie in the plane
+MIN_DISTANCE = 1.0  # metres; nearer returns are from the vehicle itself
+CELL = 1.0  # side of the cells whose lowest points are used, metres
+RADIUS = 20.0  # metres; farther points are not used
+HALF_WEIGHT = 8.0  # distance at which a cell counts half as much as at the sensor, metres
+TRIES = 400  # number of planes that are tried, each through three low points
+MIN_AREA = 1.0  # least double area of the triangle between the three points, square metres
+TOLERANCE = 0.1  # largest distance of the ground's points from the plane, metres
+MAX_SLOPE = 25.0  # degrees; steeper planes are walls and embankments
+MIN_CELLS = 30  # least number of cells with points
+MIN_AGREEMENT = 0.25  # least weighted share of the cells that lie in the plane
 
-# Which side of the plane is up: the ground has things on it, and little below it
-OFF_PLANE = 0.3  # metres from the plane within which points belong to it, at the sensor
-CURVED = 0.02  # metres more for each metre of distance from the sensor
-MAX_BELOW = 0.1  # share of the points that may be below the plane, unless more are above it
-MIN_HEIGHT = -0.5  # metres of the origin over the plane; if it is lower, the plane must be sure
-MAX_HEIGHT = 10.0  # metres of the origin over the plane; if it is higher, the plane is a wall
+# Which side of the plane is up? The ground has things above it, and little below it.
+OFF_PLANE = 0.3  # distance within which points at the sensor belong to the plane, metres
+CURVED = 0.02  # what is added to this distance for each metre from the sensor, metres
+MAX_BELOW = 0.1  # largest share of the points below the plane, unless more are above it
+MIN_HEIGHT = -0.5  # height of the origin over the plane, metres; if lower, the plane must be sure
+MAX_HEIGHT = 10.0  # height of the origin over the plane, metres; if higher, the plane is a wall
 
-# When a plane is sure enough to turn a scan by it. In real scans in all orientations, the ground
-# has 0.3 to 0.7 of the points within `TOLERANCE` and 0.4 to 0.8 of the cells, a wall at most 0.15.
-SURE_AGREEMENT = 0.3  # weighted share of the cells
-SURE_CELLS = 40  # square metres, weighted by their distance
-SURE_SHARE = 0.2  # of the points within `RADIUS` that must lie in the plane
+# When is a plane sure enough to turn a scan by it? In real scans in all orientations, the ground
+# has 0.3 to 0.7 of the points within `TOLERANCE` and 0.4 to 0.8 of the cells. A wall has at most
+# 0.15.
+SURE_AGREEMENT = 0.3  # least weighted share of the cells
+SURE_CELLS = 40  # least area of the cells, weighted by their distance, square metres
+SURE_SHARE = 0.2  # least share of the points within `RADIUS` that lie in the plane
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,9 @@ class Ground:
     """The ground plane of a scan.
 
     Attributes:
-        up: (3,) its normal, of length 1.
-        height: metres of the origin over it, along z.
-        is_sure: whether it is certain enough to turn the scan by it.
+        up: (3,) the normal of the plane, of length 1.
+        height: height of the origin over the plane along z, metres.
+        is_sure: whether the plane is sure enough to turn the scan by it.
     """
 
     up: np.ndarray
@@ -54,8 +55,8 @@ class Ground:
 def find_ground(xyz: np.ndarray) -> Ground | None:
     """Find the ground of a scan whose z axis points more or less up; None if there is none.
 
-    The ground is the plane through three low points that has many low points in it and few below
-    it, refined by least squares. Near points count more.
+    Of many planes through three low points, the ground is the plane with many low points in it and
+    few below it. Least squares refine it. Near points count more.
 
     Args:
         xyz: (N, 3) finite points, metres.
@@ -102,9 +103,9 @@ def find_ground(xyz: np.ndarray) -> Ground | None:
 
 
 def _sides(xyz: np.ndarray, plane: np.ndarray) -> tuple[float, float]:
-    """Return the shares of the (N, 3) points that are clearly above and below a plane.
+    """Return the share of the points (N, 3) that are clearly above a plane, and clearly below it.
 
-    Far points count, too: next to a raised road, more near points may be below it than above.
+    Far points count as well: next to a raised road, more near points may be below it than above.
     """
     off_plane = xyz[:, 2] - _with_ones(xyz) @ plane
     least = OFF_PLANE + CURVED * np.hypot(xyz[:, 0], xyz[:, 1])
@@ -112,7 +113,7 @@ def _sides(xyz: np.ndarray, plane: np.ndarray) -> tuple[float, float]:
 
 
 def _lowest_points(xyz: np.ndarray) -> np.ndarray:
-    """Return the (M, 3) lowest points of the cells around the sensor."""
+    """Return the lowest point of each cell around the sensor, (M, 3)."""
     column, row = np.floor((xyz[:, :2] + RADIUS) / CELL).astype(np.int64).T
     cell = column * int(2 * RADIUS / CELL + 1) + row
 
@@ -122,10 +123,10 @@ def _lowest_points(xyz: np.ndarray) -> np.ndarray:
 
 
 def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
-    """Return (a, b, c) of the plane z = a x + b y + c that most (M, 3) low points agree with.
+    """Return (a, b, c) of the plane z = a x + b y + c that most low points (M, 3) agree with.
 
-    Return None if every plane is too steep. The draws are seeded: the same points give the same
-    plane.
+    Return None if every plane is too steep. The random draws are seeded, so that the same points
+    give the same plane.
     """
     rng = np.random.default_rng(0)
     triples = low[rng.choice(len(low), (TRIES, 3), p=weight / weight.sum())]  # (tries, 3, 3)
@@ -145,5 +146,5 @@ def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
 
 
 def _with_ones(xyz: np.ndarray) -> np.ndarray:
-    """Return (M, 3) rows x, y, 1: times (a, b, c), they are the heights of a plane."""
+    """Return rows x, y, 1, (M, 3). Their product with (a, b, c) is the height of the plane."""
     return np.column_stack([xyz[:, :2], np.ones(len(xyz))])

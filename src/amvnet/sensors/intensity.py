@@ -1,7 +1,7 @@
 """Bring intensities to the range and the distribution that some weights know.
 
-Sensors and tools write them as fractions or in 8 or 16 bits, calibrated or not. All decisions rest
-on quantiles, so that a few outliers change nothing.
+Sensors and tools write intensities as fractions, in 8 bits or in 16 bits, calibrated or not. All
+decisions rest on quantiles, so that a few outliers change nothing.
 """
 
 from __future__ import annotations
@@ -22,23 +22,22 @@ from amvnet.scan import Scan
 PROBABILITIES = (0.001, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999)
 MEDIAN = PROBABILITIES.index(0.5)
 BRIGHT = PROBABILITIES.index(0.9)
-DARKEST = 0.004  # one step of 8 bits: below it, factors mean nothing
-# Factors by which the median or the bright quantile of two distributions that are alike may differ,
-# and of two scans whose intensities have the same range.
-ALIKE = 2.0
-ONE_RANGE = 8.0
-CONSTANT = 0.01  # share of the median: if 98 % of the intensities differ by less, they say nothing
+DARKEST = 0.004  # one step of 8 bits; factors between darker intensities mean nothing
+# The largest factor between the medians, and between the bright quantiles, ...
+ALIKE = 2.0  # ... of two distributions that are alike
+ONE_RANGE = 8.0  # ... of two scans whose intensities have the same range
+CONSTANT = 0.01  # share of the median; if 98 % of the intensities differ by less, they say nothing
 BLIND_SHARE = 0.2  # networks that saw this share of their scans without intensity need none
 
-# Quantiles of the intensities in simulated training scans, for weights that do not carry theirs.
+# Quantiles of the intensities in simulated training scans. Weights without quantiles of their own
+# use these.
 QUANTILES = {
     "hdl64e": (0.0, 0.0, 0.07, 0.133, 0.232, 0.311, 0.396, 0.492, 0.565, 0.755, 0.986),
     "hdl32e": (0.0, 0.0, 0.005, 0.007, 0.011, 0.039, 0.066, 0.11, 0.17, 0.265, 0.792),
 }
-LARGEST = 1e9  # no device writes larger intensities
-# Keys of a part's training record: the quantiles, and `TrainedIntensity.is_matched`
-KEY = "intensity_quantiles"
-MATCHED = "match_intensity"
+LARGEST_INTENSITY = 1e9  # no device writes larger intensities
+KEY = "intensity_quantiles"  # key of the quantiles in a part's training record
+MATCHED = "match_intensity"  # key of `TrainedIntensity.is_matched` in a part's training record
 NO_INTENSITY = [0.0] * len(PROBABILITIES)  # the quantiles of training scans without intensities
 
 
@@ -47,10 +46,10 @@ class TrainedIntensity:
     """The intensities that some networks were trained with.
 
     Attributes:
-        quantiles: of the intensities of the training scans in [0, 1], at `PROBABILITIES`.
-        is_optional: whether the networks learnt to do without intensities, as zeros.
-        is_matched: whether the intensities of each scan are brought to this distribution, as after
-            a training on simulated scans, whose distribution no real sensor has.
+        quantiles: the quantiles at `PROBABILITIES` of the training scans' intensities in [0, 1].
+        is_optional: whether the networks learnt to label scans whose intensities are all zero.
+        is_matched: whether the intensities of each scan are brought to this distribution. Networks
+            trained on simulated scans need this: no real sensor has the simulated distribution.
     """
 
     quantiles: Sequence[float]
@@ -59,14 +58,17 @@ class TrainedIntensity:
 
     @property
     def are_fractions(self) -> bool:
-        """Whether they lie in [0, 1]; networks that were trained with others take these."""
+        """Whether the intensities lie in [0, 1].
+
+        If not, the networks were trained with other intensities and take such intensities.
+        """
         return self.quantiles[-1] <= 1
 
     def filler(self, count: int) -> np.ndarray:
         """Return (count,) float32 intensities for a scan that has none.
 
-        They are zeros for networks that learnt to do without intensities. Other networks would take
-        a constant for a material, and get seeded draws from the distribution of their training.
+        Networks that learnt to do without intensities get zeros. Other networks would take a
+        constant for a material. They get seeded random draws from the training's distribution.
         """
         if self.is_optional:
             return np.zeros(count, np.float32)
@@ -114,10 +116,12 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
 
 
 def prepare(scan: Scan, trained: TrainedIntensity | None) -> Scan:
-    """Return a scan with the intensities that the networks take; every entry calls this.
+    """Return a scan with the intensities that the networks take.
+
+    Everything that segments scans calls this.
 
     Raises:
-        InputError: as `check_intensity`.
+        InputError: if `check_intensity` raises it.
     """
     if trained is None or trained.are_fractions:
         scan = check_intensity(scan)
@@ -125,15 +129,15 @@ def prepare(scan: Scan, trained: TrainedIntensity | None) -> Scan:
 
 
 def simulated_intensity(sensor: str) -> TrainedIntensity:
-    """Return the intensities that scans of a simulated sensor are brought to in training."""
+    """Return the intensities to which the scans of a simulated sensor are brought in training."""
     return TrainedIntensity(QUANTILES[sensor], is_matched=True)
 
 
 def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
     """Return a scan with its intensities brought to the distribution of a training.
 
-    The scan stays as it is if the training does not ask for this (`TrainedIntensity.is_matched`),
-    or if its intensities say nothing, such as zeros everywhere.
+    The scan is returned unchanged if the training does not ask for this
+    (`TrainedIntensity.is_matched`), or if its intensities say nothing, such as zeros everywhere.
     """
     if trained is None or not trained.is_matched:
         return scan
@@ -151,9 +155,10 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
 
 
 def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the different quantiles of some scans, and what they become, linearly in between.
+    """Return the distinct quantiles of some scans, and the intensities that they become.
 
-    Equal quantiles, as of many zeros, become the mean of the training's quantiles in their place.
+    Intensities between two quantiles are interpolated linearly. If quantiles are equal, as with
+    many zeros, they become the mean of the training's quantiles at their probabilities.
     """
     levels, index = np.unique(quantiles, return_inverse=True)
     becomes = np.bincount(index, weights=trained) / np.bincount(index)
@@ -161,11 +166,12 @@ def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarra
 
 
 def are_quantiles(values: Any) -> TypeGuard[list[float]]:
-    """Return whether a value from a file can be quantiles at `PROBABILITIES`, not all equal."""
+    """Return whether a value of a file is quantiles at `PROBABILITIES` that are not all equal."""
     if not isinstance(values, list) or len(values) != len(PROBABILITIES):
         return False
-    if not all(type(value) in (int, float) and 0 <= value < LARGEST for value in values):
-        return False  # NaN, too
+    are_numbers = all(type(value) in (int, float) for value in values)
+    if not are_numbers or not all(0 <= value < LARGEST_INTENSITY for value in values):
+        return False  # also for NaN
     is_increasing = bool((np.diff(values) >= 0).all())
     return is_increasing and not is_constant(values)
 
@@ -181,7 +187,7 @@ def check_quantiles(values: Any, source: str) -> list[float]:
 
 
 def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
-    """Return the quantiles of (N,) intensities at `PROBABILITIES`; None if there are none.
+    """Return the quantiles of intensities (N,) at `PROBABILITIES`; None if there are none.
 
     Intensities that are not finite are left out.
     """
@@ -191,7 +197,8 @@ def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
     if not len(finite):
         return None
 
-    ascending = np.sort(finite).astype(np.float64)  # NumPy's quantiles are four times as fast
+    # NumPy's quantiles are four times as fast on sorted values.
+    ascending = np.sort(finite).astype(np.float64)
     return np.quantile(ascending, PROBABILITIES)
 
 
@@ -203,7 +210,7 @@ def is_constant(quantiles: np.ndarray | Sequence[float]) -> bool:
 
 
 def are_of_one_range(a: np.ndarray | None, b: np.ndarray | None) -> bool:
-    """Return whether the intensities of two scans have the same range, by their quantiles."""
+    """Return whether the intensities of two scans have the same range, given their quantiles."""
     if a is None or b is None:
         return a is None and b is None
     if is_constant(a) or is_constant(b):
@@ -214,7 +221,7 @@ def are_of_one_range(a: np.ndarray | None, b: np.ndarray | None) -> bool:
 def _are_alike(
     a: np.ndarray | Sequence[float], b: np.ndarray | Sequence[float], factor: float, least: float
 ) -> bool:
-    """Return whether compared quantiles, raised to `least`, differ by at most a factor."""
+    """Return whether the medians and bright quantiles, at least `least`, differ by a factor."""
     for index in (MEDIAN, BRIGHT):
         low, high = sorted((max(a[index], least), max(b[index], least)))
         if high > factor * low:
@@ -224,7 +231,7 @@ def _are_alike(
 
 @dataclass(frozen=True)
 class IntensityMap:
-    """How the intensities of some scans become those that some weights know.
+    """How the intensities of some scans become intensities that some weights know.
 
     Attributes:
         text: describes the map to the user.
@@ -239,7 +246,7 @@ class IntensityMap:
     trained: TrainedIntensity | None = None
 
     def __call__(self, intensity: np.ndarray | None, count: int) -> np.ndarray:
-        """Return the (count,) intensities in [0, 1] of a scan; NaN stays NaN."""
+        """Return a scan's intensities in [0, 1], (count,); NaN stays NaN."""
         with np.errstate(over="ignore", invalid="ignore"):
             if intensity is not None and self.scale is not None:
                 return as_fractions(intensity, self.scale)
@@ -257,11 +264,12 @@ def intensity_map(
 ) -> IntensityMap:
     """Decide how to map the intensities of some scans.
 
-    They are divided by their scale. If their distribution then differs from that of the training,
-    it is matched by its quantiles instead, unless the user gave the scale.
+    The intensities are divided by their scale. If their distribution then differs from the
+    training's, it is matched by its quantiles instead, unless the user gave the scale.
 
     Args:
-        quantiles: of the raw intensities at `PROBABILITIES`; None if there are none.
+        quantiles: the quantiles of the raw intensities at `PROBABILITIES`; None if there are no
+            intensities.
         scale: the largest possible intensity.
         trained: the intensities of the training; None if unknown.
         is_given: whether the user gave the scale.
@@ -291,7 +299,7 @@ def intensity_map(
 
 
 def describe_filler(trained: TrainedIntensity | None) -> str:
-    """Return in words what stands in for missing intensities."""
+    """Return in words what replaces missing intensities."""
     if trained is None:
         return "0 instead"
     if trained.is_optional:

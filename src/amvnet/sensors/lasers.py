@@ -1,4 +1,4 @@
-"""Measure the lasers of a sensor in one of its scans: their field of view, and their rings."""
+"""Measure the lasers of a sensor in one of its scans: their number and their field of view."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ import numpy as np
 from amvnet.sensors.ground import MIN_DISTANCE, find_ground
 from amvnet.sensors.lidars import Sensor
 
-MIN_POINTS = 100  # fewer say nothing about the sensor
-FOV_PERCENTILES = (0.5, 99.5)  # of the elevations: the ends of the field of view
+MIN_POINTS = 100  # fewer points say nothing about the sensor
+FOV_PERCENTILES = (0.5, 99.5)  # percentiles of the elevations at the ends of the field of view
 
-# When two sensors are of one kind
-SAME_ANGLE = 6.0  # degrees: fields of view are alike if both ends differ by less
-SAME_BEAMS = 1.4  # factor: numbers of lasers are alike if they differ by less
+# Two sensors are alike if they differ by less than this.
+SAME_ANGLE = 6.0  # largest difference of each end of the field of view, degrees
+SAME_BEAMS = 1.4  # largest factor between the numbers of lasers
 
-MEASURES = ("beams", "fov_up", "fov_down", "height")  # attributes of a SensorGeometry
+MEASURES = ("beams", "fov_up", "fov_down", "height")  # the attributes of a SensorGeometry
 
 
 @dataclass(frozen=True)
 class SensorGeometry:
-    """The geometry of a sensor as far as it is known; None stands for an unknown value.
+    """The geometry of a sensor. Unknown values are None.
 
     Attributes:
         beams: number of lasers; measured if the points have rings.
         fov_up, fov_down: ends of the field of view, degrees above the horizon.
-        height: metres of the sensor over the ground.
+        height: height of the sensor over the ground, metres.
     """
 
     beams: int | None = None
@@ -39,14 +39,14 @@ class SensorGeometry:
 
     @property
     def field_of_view(self) -> tuple[float, float] | None:
-        """Its upper and lower end, degrees; None if one is unknown or they are swapped."""
+        """The upper and the lower end, degrees; None if one is unknown or they are swapped."""
         if self.fov_up is None or self.fov_down is None or self.fov_up <= self.fov_down:
             return None
         return self.fov_up, self.fov_down
 
     @classmethod
     def median(cls, geometries: Sequence[SensorGeometry]) -> SensorGeometry:
-        """Return the median of each value that is known."""
+        """Return the median of the known values of each attribute."""
         medians: dict[str, Any] = {}
         for key in MEASURES:
             values = [getattr(geometry, key) for geometry in geometries]
@@ -59,11 +59,11 @@ class SensorGeometry:
         return cls(**medians)
 
     def has_ends_of(self, other: SensorGeometry) -> bool:
-        """Return whether the fields of view are alike, as far as both are known."""
+        """Return whether the fields of view are alike. Unknown ends are alike."""
         return _is_near(self.fov_up, other.fov_up) and _is_near(self.fov_down, other.fov_down)
 
     def is_like(self, other: SensorGeometry) -> bool:
-        """Return whether the lasers are alike, as far as both are known."""
+        """Return whether the lasers are alike. Unknown values are alike."""
         if self.beams and other.beams:
             ratio = self.beams / other.beams
             if not 1 / SAME_BEAMS < ratio < SAME_BEAMS:
@@ -71,11 +71,11 @@ class SensorGeometry:
         return self.has_ends_of(other)
 
     def known(self) -> dict[str, Any]:
-        """Return the values that are known, by name."""
+        """Return the known values by name."""
         return {key: value for key, value in vars(self).items() if value is not None}
 
     def override(self, sensor: Sensor) -> SensorGeometry:
-        """Return the geometry with the known values of a sensor in place of its own."""
+        """Return the geometry with its values replaced by the known values of a sensor."""
         changes = {}
         for key in MEASURES:
             if getattr(sensor, key) is not None:
@@ -93,7 +93,7 @@ def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometr
 
     Args:
         points: (N, 3 or more) finite x, y, z in the sensor's frame, in the order of the file.
-        ring: (N,) indices of the lasers, or None if the file has none.
+        ring: (N,) index of each point's laser; None if the file has none.
     """
     lasers = measure_lasers(points, ring)
     if lasers.fov_up is None:
@@ -103,7 +103,7 @@ def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometr
 
 
 def measure_lasers(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:
-    """Measure the lasers of a sensor as `measure` does, but not its height."""
+    """Measure the lasers of a sensor as `measure` does, but not the sensor's height."""
     xyz = points[:, :3].astype(np.float64)
     is_distant = np.hypot(xyz[:, 0], xyz[:, 1]) > MIN_DISTANCE
     if is_distant.sum() < MIN_POINTS:

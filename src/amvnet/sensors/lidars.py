@@ -1,4 +1,4 @@
-"""LiDARs by name or by a YAML file: lasers, field of view, mounting, units and axes."""
+"""Describe LiDARs, by name or in a YAML file: lasers, field of view, mounting, units and axes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
 from amvnet.files import read_yaml
 
-# Metres over the ground on the cars that recorded KITTI and nuScenes.
+# Heights over the ground on the cars that recorded KITTI and nuScenes, metres.
 HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
 
 # Matrices that turn a file's x, y, z into forward, left, up.
@@ -27,7 +27,7 @@ AXES = {
     "z-down": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),  # x forward, y right, z down: aircraft
     "y-up": ((0, 0, -1), (-1, 0, 0), (0, 1, 0)),  # x right, y up, z backward: computer graphics
 }
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # metres
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # each unit in metres
 Triple = tuple[float, float, float]
 # How the names of a maker's LiDARs begin.
 MAKERS = {
@@ -36,24 +36,24 @@ MAKERS = {
     "hesai": ("pandar", "xt"),
     "robosense": ("rs",),
 }
-LARGEST = 1e9  # of the numbers that describe a sensor
+LARGEST_NUMBER = 1e9  # largest number in the description of a sensor
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What is known of a LiDAR and the frame of its scans; None stands for a value to measure.
+    """What is known about a LiDAR and the frame of its scans. Values that are None are measured.
 
     Attributes:
-        name: for messages.
+        name: the name of the sensor; messages state it.
         beams: number of lasers.
         fov_up, fov_down: ends of the field of view, degrees above the horizon.
-        height: metres over the ground.
+        height: height over the ground, metres.
         intensity_scale: the largest possible intensity.
-        unit: of the coordinates, a name in `UNITS`.
-        axes: which way the axes point, a name in `AXES`.
-        rotate: yaw, pitch and roll in degrees, which turn the scan level and +x forward after
-            `axes`.
-        offset: metres added to x, y and z after `rotate`, which bring the sensor to the origin.
+        unit: the unit of the coordinates, a name in `UNITS`.
+        axes: the directions of the axes, a name in `AXES`.
+        rotate: yaw, pitch and roll, degrees. Applied after `axes`, they turn the scan level and +x
+            forward.
+        offset: x, y and z, metres. Added after `rotate`, they bring the sensor to the origin.
 
     Raises:
         InputError: if a value is impossible.
@@ -76,11 +76,12 @@ class Sensor:
         is_below = _is_within(self.fov_down, -90, top) and self.fov_down != top
 
         self._check("name", isinstance(self.name, str), "a text")
-        self._check("beams", is_whole and _is_within(self.beams, 1, LARGEST), "a whole number")
+        is_count = is_whole and _is_within(self.beams, 1, LARGEST_NUMBER)
+        self._check("beams", is_count, "a whole number")
         self._check("fov_up", _is_within(self.fov_up, -90, 90), "degrees from -90 to 90")
         self._check("fov_down", is_below, "degrees from -90 to 90, below fov_up")
         self._check("height", _is_within(self.height, 0, 100), "metres from 0 to 100")
-        is_scale = _is_within(self.intensity_scale, 0, LARGEST) and self.intensity_scale != 0
+        is_scale = _is_within(self.intensity_scale, 0, LARGEST_NUMBER) and self.intensity_scale != 0
         self._check("intensity_scale", is_scale, "a number above 0")
         self._check("unit", self.unit in (None, *UNITS), f"one of {', '.join(UNITS)}")
         self._check("axes", self.axes in (None, *AXES), f"one of {', '.join(AXES)}")
@@ -100,10 +101,10 @@ class Sensor:
         return axes if self.rotate is None else rotation_from_degrees(*self.rotate) @ axes
 
     def to_level(self, xyz: np.ndarray) -> np.ndarray:
-        """Return the (N, 3) points of a file in metres and in the package's axes.
+        """Return the points (N, 3) of a file in metres and in the package's axes.
 
-        Unknown values change nothing. If points are scaled, turned or moved, they are float64, and
-        lost points, which are at the file's origin, become NaN.
+        Unknown values change nothing. If the points are scaled, turned or moved, the result is
+        float64. Lost points, which are at the file's origin, then become NaN.
         """
         scale = UNITS[self.unit or "m"]
         turn = self.turn
@@ -111,7 +112,7 @@ class Sensor:
         if scale == 1 and not offset.any() and np.array_equal(turn, np.eye(3)):
             return xyz
 
-        # Numbers that become too large are infinite, and their points invalid.
+        # Numbers that become too large are infinite; then their points are invalid.
         with np.errstate(over="ignore", invalid="ignore"):
             level = xyz.astype(np.float64) * scale @ turn.T + offset
         level[(xyz == 0).all(axis=1)] = np.nan
@@ -150,8 +151,8 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
     """Return a sensor with some attributes overridden.
 
     Args:
-        sensor: a name in `SENSORS`, attributes of `Sensor`, or a YAML file with them; None stands
-            for an unknown sensor.
+        sensor: a name in `SENSORS`; attributes of `Sensor`; or a YAML file with such attributes. By
+            default the sensor is unknown.
         options: attributes of `Sensor`, which take precedence unless they are None. `rotate` and
             `offset` may be texts of three numbers separated by commas.
 
@@ -176,7 +177,7 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
 
 
 def _read_sensor(text: str) -> Sensor:
-    """Return the sensor with this name, or of this YAML file."""
+    """Return the sensor that a text names, or that a YAML file describes."""
     if text in SENSORS:
         return SENSORS[text]
 
@@ -209,7 +210,7 @@ def _models_of(text: str) -> list[str]:
 
 
 def _to_triple(value: Any) -> Any:
-    """Return three numbers from a list or a text, and anything else as it is."""
+    """Return the three numbers in a list or a text; return anything else unchanged."""
     try:
         a, b, c = map(float, value.split(",") if isinstance(value, str) else value)
     except (TypeError, ValueError, OverflowError):

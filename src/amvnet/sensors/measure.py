@@ -17,19 +17,19 @@ from amvnet.sensors.intensity import are_of_one_range, quantiles_of
 from amvnet.sensors.lasers import SensorGeometry, measure_lasers
 from amvnet.sensors.lidars import Sensor
 
-MEASURED = 5  # first scans of a recording that are measured; later scans get their median
-STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
+MEASURED = 5  # number of scans that are measured in a recording; later scans get their median
+STEADY = 0.4  # metres; if heights in a recording differ by more, each scan gets its own height
 QUICK_STEP = 7  # every 7th point suffices for most sensors; 7 divides no usual number of lasers
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What was measured of the sensor of a scan, or of several scans as their median.
+    """What was measured about the sensor of a scan, or the median over several scans.
 
     Attributes:
         frame: the frame of the coordinates in the files.
-        lasers: the sensor's lasers, without its height.
-        quantiles: of the intensities in the files; None if there are none.
+        lasers: the sensor's geometry, without its height.
+        quantiles: the quantiles of the intensities in the files; None if there are none.
         is_steady: whether the scans were recorded in one frame, at one height.
     """
 
@@ -39,20 +39,24 @@ class Estimate:
     is_steady: bool = True
 
     def is_like(self, other: Estimate) -> bool:
-        """Return whether two estimates are of one sensor, by lasers and ranges of intensity."""
+        """Return whether two estimates can be of one sensor.
+
+        The lasers and the ranges of the intensities must be alike.
+        """
         is_of_one_range = are_of_one_range(self.quantiles, other.quantiles)
         return is_of_one_range and self.lasers.is_like(other.lasers)
 
 
 class Recording:
-    """What is assumed about the scans of one recording, measured in the first of them.
+    """What is assumed about the scans of one recording.
 
-    Each scan gets the median of the first `MEASURED` estimates. If these are of several sensors,
-    each scan gets its own estimate, and so does a later scan of another sensor.
+    The first `MEASURED` scans are measured, and each scan gets the median of their estimates. If
+    the first scans are of several sensors, each scan gets its own estimate. A later scan of another
+    sensor also gets its own.
 
     Args:
-        sensor: what is known of the sensor; the rest is measured.
-        usual_height: as for `Frame.rises`.
+        sensor: what is known about the sensor; the rest is measured.
+        usual_height: the argument of `Frame.rises`.
 
     Attributes:
         usual: the median; None before anything is measured, or if there are several sensors.
@@ -71,12 +75,12 @@ class Recording:
         return self._is_learnt and self.usual is None
 
     def recall(self, usual: Estimate | None) -> None:
-        """Take `usual` from another process; if None, each scan gets its own estimate."""
+        """Take `usual` from another process. If it is None, each scan gets its own estimate."""
         self.usual = usual
         self._is_learnt = True
 
     def learn(self, first: Sequence[Callable[[], Cloud]]) -> None:
-        """Measure the first scans, given functions that read them; later scans add nothing."""
+        """Measure the first scans, which these functions read. Later scans are not measured."""
         for read in first:
             if not self._is_learnt:
                 with suppress(InputError):
@@ -110,8 +114,8 @@ class Recording:
         return self._measure_in(frame, cloud)
 
     def _measure_in(self, frame: Frame, cloud: Cloud) -> Estimate:
-        """Measure lasers and intensities of a scan whose frame is known."""
-        # The points as the sensor saw them, also those without an intensity.
+        """Measure the lasers and the intensities of a scan whose frame is known."""
+        # Points without an intensity also show the lasers.
         scan = level_scan(cloud, frame.complete(self._sensor))
         to_sensor, _ = frame.rises(self._sensor, self._usual_height)
         seen = raise_points(scan, to_sensor)
@@ -120,9 +124,9 @@ class Recording:
         return Estimate(frame, lasers, quantiles_of(cloud.measured_intensity()))
 
     def _recognises(self, cloud: Cloud, usual: Estimate) -> bool:
-        """Return whether a scan is of the usual sensor, if it is in the usual frame.
+        """Return whether a scan, assumed to be in the usual frame, is of the usual sensor.
 
-        For most scans, some of the points are enough to tell.
+        For most scans, every 7th point is enough to tell.
         """
         for step in (QUICK_STEP, 1):
             part = dataclasses.replace(
@@ -145,7 +149,7 @@ class Recording:
 
 
 def median_of(estimates: Sequence[Estimate]) -> Estimate:
-    """Return the median of each value that is known."""
+    """Return the median of the known values of some estimates."""
     frames = [estimate.frame for estimate in estimates]
     quantiles = [each.quantiles for each in estimates if each.quantiles is not None]
 
@@ -169,13 +173,13 @@ def _are_steady(frames: Sequence[Frame]) -> bool:
 
 
 def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:
-    """Return a scan in the package's axes, with (N,) intensities in [0, 1] or zeros."""
+    """Return a scan in the package's axes, with intensities (N,) in [0, 1]; by default zeros."""
     xyz = sensor.to_level(cloud.xyz)
     return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 
 
 def raise_points(scan: Scan, rise: float) -> Scan:
-    """Return the scan moved up by some metres."""
+    """Return the scan moved up by `rise` metres."""
     if not rise:
         return scan
 

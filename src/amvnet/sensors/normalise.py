@@ -29,7 +29,7 @@ from amvnet.sensors.measure import (
     raise_points,
 )
 
-HIGHEST = 4.5  # metres: no vehicle carries its sensor higher; the coordinates may be in feet
+HIGHEST = 4.5  # metres; no vehicle carries its sensor higher, so the coordinates may be in feet
 OUTSIDE = 0.16  # largest share of the points outside a field of view that is wide enough
 
 
@@ -39,10 +39,11 @@ class Expectation:
 
     Attributes:
         view: the range view of the weights.
-        sensor: the sensor that they were trained for, as far as it is known (`trained_sensor`).
-        intensity: the intensities that they were trained with; None if unknown.
-        as_is: whether they were trained on scans that were not normalised. Scans with the same
-            field of view then keep the rows of the training, however many points are outside.
+        sensor: what is known about the sensor that the weights were trained for
+            (`trained_sensor`).
+        intensity: the intensities that the weights were trained with; None if unknown.
+        as_is: whether the weights were trained on scans that were not normalised. Scans with the
+            same field of view then keep the training's rows, however many points are outside it.
     """
 
     view: RangeViewConfig
@@ -59,12 +60,12 @@ class Expectation:
 def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> Scan:
     """Return a scan as some weights expect it; its points keep their order and number.
 
-    The scan is turned level and moved to the height of the training's sensor. Its `row` is by laser
-    if the weights' rows are lasers and the scan's lasers are known, else by the elevation before
-    the move, as the sensor saw the point.
+    The scan is turned level and moved to the height of the training's sensor. If the weights' rows
+    are lasers and the scan's lasers are known, the lasers decide `Scan.row`. Otherwise the
+    elevations before the move, from which the sensor saw the points, decide it.
 
     Args:
-        sensor: what is known of it, which takes precedence over the estimate.
+        sensor: what is known about the sensor; takes precedence over the estimate.
 
     Raises:
         InputError: if no point is usable.
@@ -87,7 +88,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
 
 
 def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
-    """Say in a line what is assumed about a scan, and whether the weights know its sensor."""
+    """Return a line on what is assumed about a scan, and whether the weights know its sensor."""
     lasers = estimate.lasers.override(sensor)
     assumed = [
         cloud.note,
@@ -113,13 +114,14 @@ def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expecta
 
 
 class Normaliser:
-    """Normalises the scans of recordings, each by what is measured of its first scans.
+    """Normalise the scans of recordings, each recording by measuring its first scans.
 
     Args:
-        expected: what the weights expect; if None, scans are only turned as the sensor says, for
-            people to look at.
-        sensor: what is known of the sensor of the scans; the rest is measured.
-        say: called with what was assumed, once for each recording and once for other sensors in it.
+        expected: what the weights expect. If it is None, scans are only turned as the sensor says,
+            for people to look at.
+        sensor: what is known about the scans' sensor; the rest is measured.
+        say: called with a line on what was assumed, once for each recording, and once for other
+            sensors in it.
     """
 
     def __init__(
@@ -133,12 +135,12 @@ class Normaliser:
         self._say = say
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
-        self._said: set[str] = set()  # recordings about which something was said
+        self._said: set[str] = set()  # recordings whose line was already said
 
     def expect(self, source: str, read: Callable[[], Cloud]) -> None:
         """Announce the next scan of a source, before any scan is normalised.
 
-        The first ones are then measured even if another process or run normalises them.
+        The first scans are then measured even if another process or run normalises them.
         """
         first = self._first.setdefault(source, [])
         if len(first) < MEASURED:
@@ -192,8 +194,8 @@ class Normaliser:
     def target(self) -> dict[str, float]:
         """Return the sensor's measures for weights that are trained on the normalised scans.
 
-        The height is the height that the scans are moved to. The lasers are those of the scans, or,
-        if the rows of the range image are lasers, those that decide the rows.
+        The height is the height to which the scans are moved. The lasers are the scans' lasers; but
+        if the rows of the range image are rings, they are the lasers that decide the rows.
         """
         assert self.expected is not None
         recordings = self._recordings.values()
@@ -249,10 +251,10 @@ def _intensity_map(
 def _row_view(
     points: np.ndarray, lasers: SensorGeometry, expected: Expectation
 ) -> RangeViewConfig | None:
-    """Return the range view that gives (P, 4) points their rows by elevation.
+    """Return the range view that gives points (P, 4) their rows by elevation.
 
-    It is the view of the weights, but with the sensor's field of view if too many points are
-    outside. Return None if the rows are lasers and their elevations are unknown.
+    It is the weights' view. If too many points are outside its field of view, it gets the sensor's
+    field of view. Return None if the rows are rings whose elevations are unknown.
     """
     view = _trained_view(lasers, expected)
     if view is None or (expected.as_is and lasers.has_ends_of(expected.lasers)):
@@ -269,8 +271,8 @@ def _row_view(
 def _trained_view(lasers: SensorGeometry, expected: Expectation) -> RangeViewConfig | None:
     """Return the range view of the weights with rows by elevation.
 
-    If the rows are lasers, the highest laser gets the first row and the lowest one the last. Return
-    None if their elevations are unknown.
+    If the rows are rings, the highest laser gets the first row and the lowest laser the last.
+    Return None if their elevations are unknown.
     """
     view = expected.view
     if view.rows != "ring":
@@ -283,9 +285,9 @@ def _trained_view(lasers: SensorGeometry, expected: Expectation) -> RangeViewCon
 
 
 def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) -> RangeViewConfig:
-    """Return the view with rows by elevation, for lasers between two elevations.
+    """Return the view with rows by elevation, for lasers from one elevation to another.
 
-    Its field of view is wider by half a step at each end, so that the lasers lie inside.
+    Its field of view is wider by half a step at each end, so that all lasers lie inside.
     """
     top, bottom = ends
     half = (top - bottom) / (2 * steps)
@@ -295,13 +297,13 @@ def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) 
 def _rows(
     scan: Scan, valid: np.ndarray, view: RangeViewConfig | None, expected: Expectation
 ) -> np.ndarray | None:
-    """Return each point's (N,) row by elevation, 0 the top; -1 for lost points.
+    """Return the row of each point by elevation, (N,); 0 is the top, -1 a lost point.
 
-    Return None if the weights need rings, and either the scan's rings are what they need, or
-    neither the scan nor its elevations give rows.
+    Return None if the weights' rows are rings, and the scan's rings suit them, or nothing gives
+    rows.
     """
     ring = scan.ring if expected.view.rows == "ring" else None
-    # Lasers that no data sheet describes need not be evenly spaced.
+    # If no data sheet describes the lasers, they may be unevenly spaced.
     is_trusted = ring is not None and expected.sensor.name not in SENSORS
     if view is None or is_trusted:
         return None
@@ -310,7 +312,7 @@ def _rows(
     rows[valid] = RangeView(view).rows(PointBatch.of([scan])).numpy()
     if ring is not None:
         by_ring = view.height - 1 - ring
-        if np.median(np.abs(by_ring - rows)[valid]) < 1:  # most rings are the rows
+        if np.median(np.abs(by_ring - rows)[valid]) < 1:  # most rings agree with the rows
             return None
     return rows
 
@@ -318,10 +320,10 @@ def _rows(
 def _rows_by_laser(
     cloud: Cloud, lasers: SensorGeometry, expected: Expectation
 ) -> np.ndarray | None:
-    """Return each point's (N,) row by its laser, 0 the top.
+    """Return the row of each point by its laser, (N,); 0 is the top.
 
-    Return None if the weights' rows are no lasers, the scan's lasers are unknown, or they are not
-    like the lasers of the training.
+    Return None if the weights' rows are not lasers, the scan's lasers are unknown, or they are
+    unlike the training's lasers.
     """
     view = expected.view
     if not view.lasers or not lasers.has_ends_of(expected.lasers):
@@ -336,7 +338,7 @@ def _rows_by_laser(
 
 
 def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
-    """Return what was guessed about the frame, each guess with its option."""
+    """Return the guesses about the frame in words, each with the option that states it."""
     texts = []
     if sensor.unit is None and frame.unit != "m":
         texts.append(f"--unit {frame.unit}")
@@ -360,7 +362,7 @@ def _describe_negative(cloud: Cloud) -> str:
 
 
 def _describe_height(frame: Frame, sensor: Sensor, usual_height: float | None) -> str:
-    """Return how high the sensor is, and how far scans are moved for that."""
+    """Return in words how high the sensor is, and how far its scans are moved."""
     height = sensor.height if sensor.height is not None else frame.height
     if height is None:
         return "no ground to measure the height by (give --height; --axes if z is not up)"

@@ -1,4 +1,4 @@
-"""The sensor that weights were trained for: by their training records, or else by its name."""
+"""Find out for which sensor weights were trained: from their training records or its name."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from amvnet.sensors.lasers import MEASURES, SensorGeometry, elevations, measure
 from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
 from amvnet.sensors.normalise import Normaliser
 
-KEY = "sensor"  # of a part's training record
-AS_IS = "as_is"  # key under `KEY`: whether the scans of the training were not normalised
-MEASURED_RECORDINGS = 20  # recordings of a user's own scans in which the sensor is measured
-LARGEST = 1e6  # no measure of a sensor is larger
+KEY = "sensor"  # key of the sensor in a part's training record
+AS_IS = "as_is"  # key under `KEY`: whether the training's scans were not normalised
+MEASURED_RECORDINGS = 20  # most recordings of a user's own scans in which the sensor is measured
+LARGEST_MEASURE = 1e6  # no measure of a sensor is larger
 
 
 def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
-    """Return the sensor that weights were trained for; None stands for unknown values.
+    """Return the sensor that weights were trained for. Its unknown values are None.
 
     Args:
         training: the training records of the weights by part.
-        name: the name of the sensor in the weights, for the values that no record has.
+        name: the name of the sensor in the weights, whose data sheet gives the values that no
+            record has.
     """
     known = dataclasses.replace(SENSORS.get(name, Sensor(name)), height=HEIGHTS.get(name))
     for record in _sensor_records(training):
@@ -56,13 +57,13 @@ def _with_measures(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
         value = record.get(key)
         if not isinstance(value, int | float) or isinstance(value, bool):
             continue
-        if abs(value) < LARGEST:  # also false for NaN
+        if abs(value) < LARGEST_MEASURE:  # also false for NaN
             measures[key] = round(value) if key == "beams" else float(value)
 
     measured = SensorGeometry(fov_up=measures.get("fov_up"), fov_down=measures.get("fov_down"))
     sheet = SensorGeometry(fov_up=sensor.fov_up, fov_down=sensor.fov_down)
     if measures and not measured.has_ends_of(sheet):
-        measures.setdefault("beams", None)  # not the sensor of the data sheet
+        measures.setdefault("beams", None)  # it is not the sensor of the data sheet
 
     try:
         return dataclasses.replace(sensor, **measures)
@@ -71,9 +72,9 @@ def _with_measures(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
 
 
 def measure_sensor(scans: Iterable[Scan]) -> dict[str, float]:
-    """Return the medians of the sensor's measures in some scans, for the weights to carry.
+    """Return the medians of the sensor's measures in some scans; the weights will carry them.
 
-    If the scans have rings, the field of view ends at the highest and the lowest laser.
+    If the scans have rings, the field of view ends at the highest and at the lowest laser.
     """
     measured = []
     for scan in scans:
@@ -89,7 +90,10 @@ def measure_sensor(scans: Iterable[Scan]) -> dict[str, float]:
 def _with_laser_ends(
     geometry: SensorGeometry, points: np.ndarray, ring: np.ndarray | None
 ) -> SensorGeometry:
-    """Return the geometry with the median elevations of the highest and the lowest laser."""
+    """Return the geometry whose field of view ends at the highest and the lowest laser.
+
+    A laser's elevation is the median over its points.
+    """
     if ring is None or geometry.fov_up is None:
         return geometry
     # Sensors report lost returns as points near the origin, at any elevation.
@@ -106,7 +110,7 @@ def _with_laser_ends(
 def normalised_record(dataset: OwnScans) -> dict[str, Any]:
     """Return the entries of a training record on the sensor of a user's normalised scans.
 
-    With them, the weights normalise other scans in the same way.
+    With these entries, the weights normalise other scans in the same way.
     """
     normaliser = dataset.normalise
     if not isinstance(normaliser, Normaliser) or normaliser.expected is None:

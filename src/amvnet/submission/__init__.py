@@ -1,1 +1,1 @@
-"""Archives for the benchmarks' servers."""
+"""Write archives of predictions for the benchmarks' servers."""

@@ -15,13 +15,13 @@ from amvnet.progress import Progress, no_progress
 from amvnet.submission.rules import LIDAR_ALONE, Rules
 
 ENDING = ".zip"
-LEVEL = 6  # of deflate: 9 takes five to eight times as long and saves a sixth
-# The time of every entry, so that the same content gives the same bytes.
+LEVEL = 6  # level of deflate; level 9 takes five to eight times as long and saves a sixth
+# Every entry has this time, so that the same content gives the same bytes.
 LONG_AGO = (1980, 1, 1, 0, 0, 0)
 # The first entry is a folder.
 ARCHIVE = Signature("an archive of submit", rb"PK\x03\x04.{26}(sequences|lidarseg)/PK")
-UNIX = 3  # code of the system that wrote an entry
-FOLDER_BIT = 0x10  # of an entry's MS-DOS attributes
+UNIX = 3  # ZIP's code for entries that Unix wrote
+FOLDER_BIT = 0x10  # the bit of an entry's MS-DOS attributes that marks a folder
 
 
 def write(
@@ -31,15 +31,15 @@ def write(
     use_external: bool = False,
     progress: Progress = no_progress,
 ) -> int:
-    """Check a folder of predictions and pack it; return their number.
+    """Check the predictions in a folder and pack them; return their number.
 
-    The same predictions give the same bytes. Files that do not belong into the archive (scores,
-    other splits) are left out. One scan is in memory at a time.
+    The same predictions give the same bytes. Files that do not belong in the archive (scores, other
+    splits) are left out. Only one scan at a time is in memory.
 
     Args:
-        folder: predictions, under the file names of `rules`.
+        folder: folder with the predictions, under the file names of `rules`.
         out: NAME.zip; it appears whole or not at all.
-        use_external: whether the method also learnt from other data, if the benchmark asks.
+        use_external: whether the method also learnt from other data; used if the benchmark asks.
         progress: called before each file and at the end.
 
     Raises:

@@ -1,6 +1,6 @@
 """What each benchmark's server expects in an archive: the files, their sizes and their ids.
 
-The rules are those of the official checkers: `validate_submission.py` (task "segmentation") and
+The official checkers have these rules: `validate_submission.py` (task "segmentation") and
 `evaluate_semantics.py` of PRBonn/semantic-kitti-api, and
 `python-sdk/nuscenes/eval/lidarseg/validate_submission.py` of nutonomy/nuscenes-devkit.
 """
@@ -20,9 +20,9 @@ from amvnet.data.labels.ids import train_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
-TEST_SCANS = 20_351  # of SemanticKITTI (KITTI odometry 11 to 21); its server requires all of them
+TEST_SCANS = 20_351  # test scans of SemanticKITTI (KITTI odometry 11 to 21); the server wants all
 
-# What a method uses, as nuScenes' submission.json declares it.
+# nuScenes' submission.json declares what a method uses.
 LIDAR_ALONE = {
     "use_camera": False,
     "use_lidar": True,
@@ -38,10 +38,10 @@ class Rules:
 
     Attributes:
         taxonomy: the classes.
-        points: the number of points of each prediction that it must contain, by name.
+        points: for each required prediction, its number of points by its name.
         dtype: number type of the ids.
         unlabelled: whether points may have no class (train id 0).
-        folders: names of the folders' entries, outer folders first, each with a trailing slash.
+        folders: names of the entries for folders, outer folders first, each with a trailing slash.
         meta: name of submission.json, which says what the method uses; None if there is none.
         official: the number of predictions that the server expects; None if it does not matter.
     """
@@ -55,7 +55,7 @@ class Rules:
     official: int | None = None
 
     def check_ids(self, data: bytes, path: Path) -> None:
-        """Raise InputError if a prediction of the right size has an id that is not allowed."""
+        """Raise InputError if a prediction has an id that is not allowed."""
         ids = train_ids(path, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
         if not self.unlabelled and not ids.all():
             raise InputError(
@@ -69,8 +69,8 @@ def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = No
     """Return the rules for the archive of one split, or of some sequences.
 
     Args:
-        dataset: its scans decide which predictions are required, and their sizes.
-        split: "test" is the split that the servers score; the others are for trials.
+        dataset: the dataset, whose scans decide which predictions are required and their sizes.
+        split: a split. The servers score "test"; other splits are for trials.
         sequences: sequences or scenes to pack instead of a split.
 
     Raises:
@@ -88,12 +88,13 @@ def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = No
 def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] | None) -> Rules:
     """Return the rules of SemanticKITTI.
 
-    The archive holds sequences/11 to 21, each with predictions/NNNNNN.label, raw ids as uint32.
+    The archive holds sequences/11 to 21, each with predictions/NNNNNN.label: raw ids as uint32.
 
-    The official validator requires a name that ends in .zip, an entry for every folder, a file
-    for every scan in the `velodyne` folders, and 4 bytes per point, but does not check the ids. The
-    server's evaluation reads unknown ids as "unlabeled" and stops at ids above 358; here, unknown
-    ids are errors. A point may be unlabelled (it counts as missed) and the upper 16 bits are free.
+    The official validator requires a name that ends in .zip, an entry for every folder, a file for
+    every scan in the `velodyne` folders, and 4 bytes per point. It does not check the ids. The
+    server's evaluation reads unknown ids as "unlabeled", and stops at ids above 358; here, unknown
+    ids are errors. A point may be unlabelled; it then counts as missed. The upper 16 bits of an id
+    are free.
     """
     wanted = dataset.taxonomy.splits[split] if sequences is None else sorted(set(sequences))
     folders = ["sequences/"]
@@ -118,8 +119,8 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     SPLIT/submission.json. TOKEN is the sample_data token of LIDAR_TOP.
 
     The official validator requires a file for every key frame that the tables list for the split,
-    one byte per point with a value of 1..16, and in submission.json a "meta" with exactly the five
-    keys of `LIDAR_ALONE`, all true or false.
+    with one byte of 1..16 for each point. In submission.json it requires a "meta" with exactly the
+    five keys of `LIDAR_ALONE`, each true or false.
     """
     scenes = dataset.scenes(split) if sequences is None else sequences
     if not scenes:

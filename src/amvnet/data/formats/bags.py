@@ -1,4 +1,4 @@
-"""Scans in ROS bags (ROS 1, ROS 2, mcap), by rosbags: the messages of one topic."""
+"""Read scans from ROS bags (ROS 1, ROS 2, mcap) with rosbags: the messages of one topic."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
 from amvnet.errors import InputError
 
-LISTED = 10  # topics in a message
+LISTED = 10  # most topics that an error message lists
 
-CHUNK = 1 << 20  # bytes that are unpacked at a time
-MIN_MESSAGE = 16  # bytes that each message takes in a bag, even if it is compressed
+CHUNK = 1 << 20  # bytes unpacked at a time
+MIN_MESSAGE = 16  # smallest size of a message in a bag, bytes, even if it is compressed
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
 
 class Bag:
-    """The scans of one topic of a bag, ordered by time. One at a time is in memory.
+    """The scans of one topic of a bag, ordered by time. Only one scan at a time is in memory.
 
     Args:
         path: the file, or the folder of a ROS 2 bag.
         ending: the storage format: `.bag`, `.mcap`, `.db3`, or empty for a folder.
-        topic: the topic of the scans; None for the only one with PointCloud2.
+        topic: the topic of the scans; by default the only topic with PointCloud2.
 
     Raises:
-        InputError: if the bag cannot be read, or has no such topic, or more than one.
+        InputError: if the bag cannot be read or has no such topic; or if `topic` is None and the
+            bag has several.
     """
 
     def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
@@ -51,7 +52,7 @@ class Bag:
         self._topic = topic
         self._count = count
 
-        # The index of the next message, and the messages from there on, to read them in order.
+        # To read messages in order: the index of the next message, and the messages from there on.
         self._next = 0
         self._rest: Iterator[bytes] = iter(())
 
@@ -59,7 +60,11 @@ class Bag:
         return self._count
 
     def read(self, index: int) -> Cloud:
-        """Read a scan by its index, fastest in order; raise InputError if it is broken."""
+        """Read the scan with an index; reading in order is fastest.
+
+        Raises:
+            InputError: if the scan is broken.
+        """
         if index != self._next or self._next == 0:
             self._next = 0
             self._rest = self._messages()
@@ -91,14 +96,14 @@ class Bag:
 
 
 def _open_reader(path: Path, ending: str) -> Any:
-    """Open a bag with rosbags, by its content and not by its name."""
+    """Open a bag with rosbags; `ending` decides the format, not the name of the file."""
     from rosbags.rosbag1 import Reader
     from rosbags.rosbag2.reader import DirectoryReader
     from rosbags.rosbag2.storage_mcap import McapReader
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
     def open_database(path: Path) -> Sqlite3Reader:
-        # rosbags makes a URI from the path; #, ? and % have a meaning there.
+        # rosbags makes a URI from the path, in which #, ? and % have a meaning.
         return Sqlite3Reader(Path(quote(str(path))))
 
     readers: dict[str, Callable[[Path], Any]] = {
@@ -118,7 +123,8 @@ def _open_reader(path: Path, ending: str) -> Any:
 def _check_unpacked(folder: Path) -> None:
     """Raise InputError if the compressed files of a bag would fill the disk.
 
-    rosbags unpacks all of them when it opens the bag, and the process only limits each of them.
+    rosbags unpacks all files when it opens the bag. The process with limits limits only the size of
+    each file.
     """
     from rosbags.rosbag2.reader import zstd
 
@@ -138,7 +144,7 @@ def _check_unpacked(folder: Path) -> None:
 
 @cache
 def types_of(is_ros1: bool) -> Any:
-    """Return the types of messages of ROS 1 or ROS 2, as rosbags stores them."""
+    """Return rosbags' store of the message types of ROS 1 or ROS 2."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
@@ -150,7 +156,7 @@ def _with_scans(connections: Iterable[Any]) -> list[Any]:
 
 
 def _choose_topic(connections: Iterable[Any], topic: str | None, path: Path) -> tuple[str, int]:
-    """Return the topic to read, by default the only one, and its number of scans."""
+    """Return the topic to read and its number of scans; by default the only topic with scans."""
     counts: dict[str, int] = {}
     for connection in _with_scans(connections):
         counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount

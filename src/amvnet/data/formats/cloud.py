@@ -1,4 +1,4 @@
-"""The points of a scan file, before anything is assumed of the sensor."""
+"""The points of a scan file, before anything is assumed about the sensor."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import FARTHEST, Scan, at_origin
 
-MAX_POINTS = 10_000_000  # of a scan: 40 times as many as the largest sensors record
-MAX_BYTES = 32 * MAX_POINTS  # of the points of a packed file
+MAX_POINTS = 10_000_000  # most points of a scan: 40 times as many as the largest sensors record
+MAX_BYTES = 32 * MAX_POINTS  # most bytes that the points of a packed file unpack to
 MOST_RINGS = 256  # a column with larger values does not hold ring indices
 
-# The largest intensities that sensors write: fractions, 8 bits, 16 bits.
+# The largest intensity that a sensor can write, as a fraction, in 8 bits or in 16 bits.
 FLOAT_RANGES = (1.0, 255.0, 65535.0)
 INTEGER_RANGES = (255.0, 65535.0)  # integers are not fractions
-WILD_SHARE = 0.001  # share of the intensities that may be above the range of the others
+WILD_SHARE = 0.001  # largest share of outliers: intensities above the range of the others
 
-Arrays = dict[str, np.ndarray]  # (N,) columns by key
-# The possible names of each column, by its key; the first that a file has is read.
+Arrays = dict[str, np.ndarray]  # columns (N,) by key
+# The possible names of each column by its key. If a file has several, the first one here is read.
 Names = Mapping[str, Sequence[str]]
 COLUMN_NAMES: Names = {
     "x": ("x",),
@@ -50,8 +50,8 @@ class Cloud:
         xyz: (N, 3) float32 or float64 coordinates, metres.
         intensity: (N,) numbers, or None if the file has none.
         ring: (N,) int64 index of the laser, or None.
-        name: where the scan comes from, for messages.
-        note: what the reader had to assume about the file; empty if nothing.
+        name: where the scan comes from; messages name it.
+        note: what the reader had to assume about the file; empty if it assumed nothing.
     """
 
     xyz: np.ndarray
@@ -62,17 +62,17 @@ class Cloud:
 
     @property
     def is_placed(self) -> np.ndarray:
-        """(N,) bool: points with finite coordinates, not at 0, 0, 0."""
-        # Column by column: a reduction over rows of three takes ten times as long.
+        """(N,) bool: whether a point has finite coordinates that are not 0, 0, 0."""
+        # Each column is checked alone: a reduction over rows of three takes ten times as long.
         x, y, z = np.isfinite(self.xyz.T)
         placed: np.ndarray = x & y & z
         placed[at_origin(self.xyz)] = False
         return placed
 
     def measured_intensity(self) -> np.ndarray | None:
-        """Return the (M,) finite intensities of points with a place; None if there are none.
+        """Return the finite intensities (M,) of points that are placed; None if there are none.
 
-        Whatever a file has as the intensity of a lost return says nothing about the others.
+        The intensity of a lost return says nothing about the other intensities.
         """
         if self.intensity is None:
             return None
@@ -83,8 +83,9 @@ class Cloud:
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.
 
-        It is the end of the usual range that the largest intensity lies in: 1 (floats only), 255 or
-        65535. Beyond these, it is that intensity itself. Outliers (`WILD_SHARE`) are left out.
+        The divisor is the end of the usual range that holds the largest intensity: 1 (floats only),
+        255 or 65535. If the largest intensity is above all ranges, it is the divisor itself.
+        Outliers (`WILD_SHARE`) are left out.
         """
         measured = self.measured_intensity()
         if self.intensity is None or measured is None:
@@ -108,7 +109,7 @@ class Cloud:
         scale = scale or self.intensity_scale()
         points = np.zeros((len(self.xyz), 4), dtype=np.float32)
 
-        # Numbers too large for float32 become infinite, which makes their points invalid.
+        # Numbers that are too large for float32 become infinite; then their points are invalid.
         with np.errstate(over="ignore", invalid="ignore"):
             points[:, :3] = self.xyz
             if self.intensity is not None and scale is not None:
@@ -120,14 +121,14 @@ class Cloud:
 
 @np.errstate(over="ignore", invalid="ignore")
 def as_fractions(intensity: np.ndarray, scale: float) -> np.ndarray:
-    """Return (N,) intensities in [0, 1], given their largest value; NaN if one is not finite."""
+    """Divide intensities (N,) by a scale and clip them to [0, 1]; NaN if one is not finite."""
     fractions: np.ndarray = np.clip(intensity / scale, 0, 1)
     is_finite = np.isfinite(intensity)
     return fractions if is_finite.all() else np.where(is_finite, fractions, np.nan)
 
 
 def usual_scale(largest: float, is_integer: bool) -> float:
-    """Return the end of the narrowest usual range of intensities that holds the largest one."""
+    """Return the end of the narrowest usual range of intensities that holds `largest`."""
     ranges = INTEGER_RANGES if is_integer else FLOAT_RANGES
     for limit in ranges:
         if largest <= limit:
@@ -163,7 +164,7 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
     """Return the number of points that a header claims, if it is plausible.
 
     Args:
-        least: bytes that a file with these points has at least; 0 if unknown.
+        least: the smallest size of a file with so many points, bytes; 0 if unknown.
 
     Raises:
         InputError: if no scan has that many points, or the file is too short for them.
@@ -186,12 +187,12 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
 
 @contextmanager
 def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
-    """Turn every error of a reader in this block into an InputError of one line.
+    """Turn every error that this block raises into an InputError of one line.
 
     Readers raise all kinds of exceptions on broken bytes. An InputError passes unchanged.
 
     Args:
-        expected: what was expected there, such as "a PCD file".
+        expected: what was expected in the file, such as "a PCD file".
         advice: what the user can do about it.
 
     Raises:
@@ -207,7 +208,7 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
 
 def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str, int]:
-    """Return the index of each wanted column that a file has, by its key; case does not matter."""
+    """Return the indices of the wanted columns that a file has, by key; case does not matter."""
     lower_names = list(map(str.lower, names))
 
     columns = {}
@@ -239,11 +240,11 @@ def require_columns(
 
 
 def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
-    """Return the NumPy type of records; bytes that belong to no column are skipped.
+    """Return the NumPy type of a record; bytes that belong to no column are skipped.
 
     Args:
         columns: for each column, its NumPy type and its offset in a record, bytes.
-        size: bytes of a record.
+        size: the size of a record, bytes.
     """
     formats, offsets = zip(*columns.values(), strict=True)
     return np.dtype(
@@ -252,14 +253,14 @@ def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
 
 
 def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
-    """Return the cloud of the (N,) columns x, y, z and, if present, intensity and ring.
+    """Return a cloud with the columns (N,) x, y, z and, if present, intensity and ring.
 
     Coordinates are float32 if all three columns are floats of at most 32 bits, else float64.
     """
     axes = (columns["x"], columns["y"], columns["z"])
     is_float32 = all(axis.dtype.kind not in "iu" and axis.dtype.itemsize <= 4 for axis in axes)
     xyz = np.empty((len(axes[0]), 3), np.float32 if is_float32 else np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):  # of signalling NaN
+    with np.errstate(invalid="ignore", over="ignore"):  # signalling NaN would cause warnings
         for column, axis in enumerate(axes):
             xyz[:, column] = axis
 
@@ -268,9 +269,10 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
 
 @np.errstate(invalid="ignore")
 def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
-    """Return (N,) values as int64 ring indices, with 0 in place of NaN and infinity.
+    """Return values (N,) as int64 ring indices, with 0 in place of NaN and infinity.
 
-    Return None if there are no values, or they are all equal, negative, too large or not whole.
+    Return None if there are no values; if all are equal; or if one is negative, too large or not
+    whole.
     """
     if values is None or not len(values):
         return None

@@ -11,11 +11,11 @@ from amvnet.errors import InputError
 
 TEXT = (".xyz", ".txt", ".csv", ".asc", ".pts")
 BAGS = (".bag", ".mcap", ".db3")
-FOLDER = ""  # instead of an ending: the folder of a ROS 2 bag
-ARCHIVE = ".zip"  # of scan files
-GZIP = ".gz"  # after the ending of a scan file
-METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
-# The endings of all files that are read; docs/own_scans.md says what is read of each kind.
+FOLDER = ""  # stands for an ending if the path is the folder of a ROS 2 bag
+ARCHIVE = ".zip"  # ending of an archive of scan files
+GZIP = ".gz"  # follows the ending of a compressed scan file
+METADATA = "metadata.yaml"  # a file in the folder of every ROS 2 bag
+# The endings of all files that are read. docs/own_scans.md says what is read from each kind.
 ENDINGS = (
     *(NUSCENES_ENDING, ".bin", ".pcd", ".ply", ".npy", ".npz"),
     *TEXT,
@@ -24,7 +24,7 @@ ENDINGS = (
     ARCHIVE,
 )
 
-# The first bytes of files.
+# The ending of a file by its first bytes.
 BEGINNINGS = {
     b"\x93NUMPY": ".npy",
     b"PK\x03\x04": ".npz",
@@ -39,15 +39,15 @@ BEGINNINGS = {
     b"ARROW1": ".feather",
     b"\x1f\x8b": GZIP,
 }
-BEGINNING = 4096  # bytes in which one of them must be found
-COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
+BEGINNING = 4096  # bytes from the start of a file in which its first bytes are looked for
+COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # may precede the header of a PCD file
 
 
 def ending_of(path: Path) -> str:
     """Return the ending that a file should have, by its first bytes, or else by its name.
 
     Raises:
-        InputError: if neither tells.
+        InputError: if neither the bytes nor the name tell the format.
     """
     if path.is_dir():
         return FOLDER
@@ -92,9 +92,9 @@ def _begins_as(beginning: bytes) -> str | None:
 
 
 def named_ending(path: Path) -> str | None:
-    """Return the known ending of a file's name; None if it has none.
+    """Return the ending of a file's name if it is one of `ENDINGS`, else None.
 
-    It is `.gz` if the rest of the name is that of a file of one scan.
+    Return `.gz` if the rest of the name belongs to a file of one scan.
     """
     name = path.name.lower()
     if name.endswith(GZIP):

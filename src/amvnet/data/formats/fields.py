@@ -1,4 +1,4 @@
-"""Records of numbers with named fields, as PCD and PLY have them: in text and in binary."""
+"""Read records of numbers with named fields, in text or in binary, as in PCD and PLY files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from amvnet.data.formats.cloud import Arrays
 from amvnet.errors import InputError
 
-HEADER = 65_536  # bytes of the longest header of a file
+HEADER = 65_536  # longest header of a file, bytes
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Fields:
     """The fields of a record, in order.
 
     Attributes:
-        names: of the fields; several fields may have the same name.
-        dtypes: NumPy types of the fields, with the byte order.
-        counts: numbers of values of the fields.
+        names: the name of each field; several fields may have the same name.
+        dtypes: the NumPy type of each field, with the byte order.
+        counts: the number of values of each field.
     """
 
     names: Sequence[str]
@@ -40,17 +40,25 @@ class Fields:
         return np.dtype(fields)
 
     def read_binary(self, file: BinaryIO, count: int, chosen: dict[str, int]) -> Arrays:
-        """Read the first value of chosen fields, by their index, of at most `count` records."""
+        """Read the first value of the chosen fields in at most `count` records.
+
+        Args:
+            chosen: the index of each field by the key of its column.
+        """
         records = np.fromfile(file, self.record, count)
         return {key: records[str(index)][:, 0] for key, index in chosen.items()}
 
     def read_text(self, file: BinaryIO, count: int, chosen: dict[str, int], path: Path) -> Arrays:
-        """Read fields of the next lines; raise InputError if some are missing."""
+        """Read the chosen fields of the next `count` lines.
+
+        Raises:
+            InputError: if there are fewer lines.
+        """
         positions = list(accumulate(self.counts, initial=0))
         columns = [positions[index] for index in chosen.values()]
         table = np.zeros((0, len(columns)))
         lines = islice(filter(bytes.strip, file), count)
-        for first in lines:  # at most once; NumPy would warn if there were no lines
+        for first in lines:  # runs at most once; NumPy would warn if there were no lines
             table = np.loadtxt(chain([first], lines), usecols=columns, comments=None, ndmin=2)
 
         if len(table) < count:
@@ -61,7 +69,7 @@ class Fields:
         arrays = {}
         with np.errstate(invalid="ignore"):
             for (key, index), values in zip(chosen.items(), table.T, strict=True):
-                # A column with NaN or infinity stays float64, because integers cannot hold these.
+                # Integers cannot hold NaN and infinity; a column with these stays float64.
                 is_finite = np.isfinite(values).all()
                 arrays[key] = values.astype(self.dtypes[index]) if is_finite else values
         return arrays
@@ -72,7 +80,7 @@ def read_header_line(file: BinaryIO, path: Path, kind: str, end: str) -> list[st
 
     Args:
         kind: what the file is, such as "a PCD file".
-        end: the line that ends its header.
+        end: the line that ends the header.
 
     Raises:
         InputError: if the file ends first, or the header is too long.

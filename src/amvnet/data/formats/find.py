@@ -29,8 +29,8 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
 
-ANY_FOLDERS = "**"  # in a pattern
-POSE_COLUMNS = 12  # KITTI's files of poses have a 3 x 4 matrix in each line
+ANY_FOLDERS = "**"  # stands for any folders in a pattern
+POSE_COLUMNS = 12  # numbers in a line of KITTI's files of poses: a 3 x 4 matrix
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,12 @@ class NamedScan:
     """A scan in a file or a bag that has not been read yet.
 
     Attributes:
-        name: unique among the scans of one input: `000000` for the file `000000.bin`,
+        name: the scan's name, unique in one input: `000000` for the file `000000.bin`,
             `drive/000000` for the first scan of the bag `drive.bag`.
-        source: names the recording: the bag, or the folder and the ending of the files.
+        source: the recording's name: the bag, or the folder and the ending of its files.
         path: the file or the bag.
-        ending: of the format, by the file's content (`ending_of`); empty for a broken file.
+        ending: the ending that belongs to the file's content (`ending_of`); empty for a broken
+            file.
         read: reads the scan.
     """
 
@@ -57,8 +58,8 @@ def find_scans(path: Path | str) -> list[Path]:
     """Return the scan files and bags that a path names, sorted by name.
 
     Args:
-        path: a file, a folder of them, or a pattern such as `drive/*.bin` or `drives/**/*.pcd`.
-            Hidden files are left out, and text files too if a folder has other scans.
+        path: a file, a folder of files, or a pattern such as `drive/*.bin` or `drives/**/*.pcd`.
+            Hidden files are left out. Text files are left out if the folder has other scans.
 
     Raises:
         InputError: if nothing has this name, or there is no scan.
@@ -90,14 +91,14 @@ def list_scans(
     layout: RowLayout = UNKNOWN,
     is_alone: bool = True,
 ) -> Iterator[NamedScan]:
-    """Yield the scans of the files that `find_scans` finds; those of a bag in its order.
+    """Yield the scans of the files that `find_scans` finds. A bag's scans keep their order.
 
-    If one of several files cannot be opened, or is a link that leads nowhere, it counts as a scan:
-    reading it raises the error.
+    If one of several files cannot be opened, or is a link that leads nowhere, it is yielded as a
+    scan, and reading this scan raises the error.
 
     Args:
-        topic: of bags; None means the only topic with scans.
-        layout: what rows of numbers without names hold, as far as the user says it.
+        topic: the topic in bags; by default the only topic with scans.
+        layout: what the user says about rows of numbers without names.
         is_alone: whether the user names no other path.
 
     Raises:
@@ -107,7 +108,7 @@ def list_scans(
     files = find_scans(path)
     folder = Path(os.path.commonpath([file.parent for file in files]))
     for file in files:
-        # Files of several folders can have the same names.
+        # Files in different folders can have the same name.
         name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
 
         try:
@@ -173,13 +174,13 @@ def _refuse(message: str) -> Cloud:
 
 
 def _scans_in(folder: Path) -> list[Path]:
-    """Return the scans of a folder; its text files only if there are no others."""
+    """Return the scans of a folder. Text files count only if there are no other scans."""
     paths = sorted(filter(is_scan_file, folder.iterdir()))
     return paths or sorted(filter(_is_text_scan, folder.iterdir()))
 
 
 def _matches(pattern: str) -> list[Path]:
-    """Return the scans that match a pattern, and the scans in folders that match."""
+    """Return the scans that match a pattern, and the scans in folders that match it."""
     paths: list[Path] = []
     for path in matching(Path(pattern)):
         if is_scan_file(path) or _is_text_scan(path):
@@ -245,7 +246,7 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def is_scan_file(path: Path) -> bool:
-    """Return whether a path is a scan or a bag, and not a file of predictions."""
+    """Return whether a path is a scan or a bag. A file of predictions is neither."""
     if path.suffix == ".npz" and path.with_suffix(".label").exists():
         return False
     if path.is_dir():
@@ -254,7 +255,7 @@ def is_scan_file(path: Path) -> bool:
 
 
 def is_scan_name(name: str) -> bool:
-    """Return whether a file is a scan or a bag by its name; a text file may be anything."""
+    """Return whether a name is that of a scan or a bag; false for text files, which vary."""
     if name.startswith(".") or name.endswith(".uncertain.npy"):
         return False
     ending = named_ending(Path(name))
@@ -262,7 +263,7 @@ def is_scan_name(name: str) -> bool:
 
 
 def _is_text_scan(path: Path) -> bool:
-    """Return whether a path is a text file of points, and not of poses."""
+    """Return whether a path is a text file of points. A file of poses is not."""
     is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
     if not is_text or not path.is_file():
         return False

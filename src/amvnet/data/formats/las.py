@@ -1,6 +1,6 @@
-"""Dimensions of LAS and LAZ files, by laspy.
+"""Read the dimensions of LAS and LAZ files with laspy.
 
-lazrs 0.8 can take any amount of memory or abort its process if a file is broken. Files are
+If a file is broken, lazrs 0.8 can take any amount of memory or abort its process. Files are
 therefore read in the process with limits.
 """
 
@@ -15,11 +15,11 @@ from amvnet.errors import InputError
 
 EXPECTED = "a LAS or LAZ file"
 ADVICE = "write the file again"
-CHUNK = 1_000_000  # points read at once
+CHUNK = 1_000_000  # points read at a time
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some dimensions of all points: x, y and z in metres, and others as in the file.
+    """Read some dimensions of all points: x, y and z in metres, others in the file's units.
 
     Raises:
         InputError: if the file is not LAS or LAZ, is truncated or lacks a dimension.
@@ -30,7 +30,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         done = 0
         with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
             count = check_point_count(file.header.point_count, path)
-            # The names of the integers that stand for coordinates differ only in their case.
+            # X, Y and Z are integers, from which laspy computes x, y and z.
             names = ["x", "y", "z"]
             for name in file.header.point_format.dimension_names:
                 if name not in ("X", "Y", "Z"):

@@ -30,17 +30,17 @@ from amvnet.data.formats.cloud import (
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
-# Names of the array of points, if an archive has several arrays.
+# Possible names of the array of points in an archive with several arrays.
 KEYS = ("points", "positions", "xyz", "scan", "arr_0")
-FEW = 10  # an array with at most as many rows and more columns is transposed
-MOST_COLUMNS = 200  # of an array without names
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # by which NumPy packs archives
+FEW = 10  # an array with at most this many rows and with more columns is transposed
+MOST_COLUMNS = 200  # most columns of an array without names that are considered
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # compressions of NumPy's archives
 ADVICE = "save it again with np.save"
 ARCHIVE_ADVICE = "save it again with np.savez"
 
 
 def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read an array, whose columns are those of the layout if it has any.
+    """Read the points of an array file. If the layout names columns, the array has these.
 
     Raises:
         InputError: if it is not an array of numbers, has an unsuitable shape or is truncated.
@@ -52,9 +52,9 @@ def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
 def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read the points of an archive.
 
-    They are its only array, or the one named `points`, `positions` (Open3D), `xyz`, `scan` or
-    `arr_0`, with arrays named `intensity` and `ring` next to it; or arrays named `x`, `y`, `z` and
-    so on.
+    The points are the only array, or the array named `points`, `positions` (Open3D), `xyz`, `scan`
+    or `arr_0`. Arrays named `intensity` and `ring` may stand next to it. Or each column is an array
+    of its own, named `x`, `y`, `z` and so on.
     """
     with reading(path, "a NumPy archive", ARCHIVE_ADVICE):
         names = member_names(path)
@@ -117,7 +117,7 @@ def read_array(path: Path, key: str | None = None) -> np.ndarray:
 
     Args:
         path: a `.npy` or `.npz` file.
-        key: the name of the array in an archive; None means the one with the points.
+        key: the name of the array in an archive; by default the array of points.
     """
     with reading(path, "NumPy arrays", ADVICE):
         if not zipfile.is_zipfile(path):
@@ -127,7 +127,7 @@ def read_array(path: Path, key: str | None = None) -> np.ndarray:
         name = _choose_member(member_names(path), path) if key is None else key
         with zipfile.ZipFile(path) as archive:
             member = archive.getinfo(f"{name}.npy")
-            if member.compress_type not in METHODS:
+            if member.compress_type not in COMPRESSIONS:
                 raise InputError(
                     f"{path}: expected an archive of NumPy, found one packed in another way; "
                     f"{ARCHIVE_ADVICE}"
@@ -152,7 +152,7 @@ def _choose_member(names: Sequence[str], path: Path) -> str:
 
 
 def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
-    """Read the array in a file, if `size` bytes can hold what its header claims."""
+    """Read the array in a file of `size` bytes, if these can hold what its header claims."""
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)

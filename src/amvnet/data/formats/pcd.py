@@ -1,7 +1,7 @@
 """Read point clouds in PCL's format: ascii, binary or binary_compressed, columns in any order.
 
-pypcd4 is not used: version 1.5 reads truncated files without an error, and ascii files only if
-single spaces separate the numbers.
+pypcd4 is not used. Version 1.5 reads truncated files without an error, and refuses ascii files
+whose numbers are not separated by single spaces.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from amvnet.errors import InputError
 KIND = "a PCD file"
 ADVICE = "write the file again"
 
-# NumPy types by the letter of TYPE and the bytes of SIZE.
+# NumPy types by a field's TYPE (a letter) and SIZE (bytes).
 TYPES = {
     "F": {4: "<f4", 8: "<f8"},
     "I": {1: "<i1", 2: "<i2", 4: "<i4", 8: "<i8"},
     "U": {1: "<u1", 2: "<u2", 4: "<u4", 8: "<u8"},
 }
 
-# LZF packs nothing more tightly than the longest repetition into its code.
+# LZF packs at most this repetition into a code of this size; no data pack more tightly.
 LONGEST_REPETITION = 264  # bytes
 REPETITION_CODE = 3  # bytes
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some fields of the points: of a field with several values, the first.
+    """Read some fields of all points. If a field has several values, only the first is read.
 
     The points of an organised cloud (a grid) come row by row.
 
@@ -54,7 +54,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         encoding = entries["DATA"][0].lower()
 
         if encoding == "ascii":
-            # Each value takes a character, and one more between any two of them.
+            # Each value takes at least one character; one more stands between any two values.
             check_point_count(points, path, 2 * sum(fields.counts) * points - 1)
             return fields.read_text(file, points, chosen, path)
 
@@ -70,7 +70,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
 
 def _read_header(file: BinaryIO, path: Path) -> dict[str, list[str]]:
-    """Return the words of the header's lines up to DATA, by the first of each."""
+    """Return the words of each line of the header, up to DATA, by the line's first word."""
     entries: dict[str, list[str]] = {}
     while "DATA" not in entries:
         words = read_header_line(file, path, KIND, "line DATA")
@@ -101,7 +101,7 @@ def _count_points(entries: dict[str, list[str]]) -> int:
 def _read_compressed(
     file: BinaryIO, fields: Fields, points: int, chosen: dict[str, int], path: Path
 ) -> Arrays:
-    """Read the first value of chosen fields, by their index, from packed points."""
+    """Read the first value of the chosen fields (indices by key) from packed points."""
     packed_size, size = struct.unpack("<II", file.read(8))
     check_point_count(points, path, file.tell() + packed_size)
     expected = points * fields.record.itemsize
@@ -110,7 +110,7 @@ def _read_compressed(
         expected = min(expected, MAX_BYTES)
         raise InputError(f"{path}: expected {expected} bytes of points, found {size}; {ADVICE}")
 
-    # Field by field: the values of all points, and the values of one point next to each other.
+    # The data hold one field after the other. In each, the values of a point are side by side.
     data = unpack_lzf(file.read(packed_size), size)
     sizes = [fields.record[index].itemsize for index in range(len(fields.names))]
     arrays = {}
@@ -130,13 +130,13 @@ def unpack_lzf(data: bytes, size: int) -> bytearray:
         control = data[position]
         position += 1
 
-        if control < 32:  # a literal: the next control + 1 bytes as they are
+        if control < 32:  # a literal: the next control + 1 bytes are copied
             output += data[position : position + control + 1]
             position += control + 1
             continue
 
-        # A back reference: 3 bits of length, followed by a byte to add if all three are set, and
-        # 13 bits of distance.
+        # A back reference has 3 bits of length and 13 bits of distance. If all 3 bits of the length
+        # are set, a byte to add to it follows.
         length = (control >> 5) + 2
         if length == 9:
             length += data[position]

@@ -1,6 +1,6 @@
-"""Point clouds in PLY files: the element `vertex`, ascii or binary of either byte order.
+"""Read point clouds from PLY files: the element `vertex`, ascii or binary in either byte order.
 
-plyfile is not used: it allocates whatever a header claims, and is under the GPL.
+plyfile is not used: it allocates whatever memory a header claims, and is under the GPL.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from amvnet.data.formats.cloud import Arrays, Names, check_point_count, reading,
 from amvnet.data.formats.fields import Fields, read_header_line
 from amvnet.errors import InputError
 
-# NumPy types by both names of each.
+# NumPy types by PLY's type names; each type has two names.
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -31,7 +31,14 @@ ADVICE = "write the file again"
 
 @dataclass
 class Element:
-    """One element of a file, such as `vertex`, with `count` rows; "list" is the type of lists."""
+    """One element of a file, such as `vertex`.
+
+    Attributes:
+        name: the element's name.
+        count: its number of rows.
+        properties: the names of its properties.
+        types: their types; "list" for a list.
+    """
 
     name: str
     count: int
@@ -64,8 +71,8 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         fields = vertex.fields(BYTE_ORDERS[encoding])
         chosen = require_columns(vertex.properties, path, wanted)
         if encoding == "ascii":
-            # Each value and each line before the vertices takes a character, and one more between
-            # any two of them.
+            # Each value takes at least one character, and so does each line before the vertices.
+            # One more character stands between any two of them.
             lines = sum(element.count for element in before)
             least = 2 * (lines + vertex.count * sum(fields.counts)) - 1
             check_point_count(lines + vertex.count, path, least)

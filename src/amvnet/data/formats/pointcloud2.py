@@ -1,6 +1,6 @@
-"""ROS messages of the type sensor_msgs/PointCloud2, without ROS.
+"""Read ROS messages of the type sensor_msgs/PointCloud2 without ROS.
 
-A message is any object with the attributes of PointCloud2: of rclpy or of rosbags.
+A message is any object with the attributes of PointCloud2, such as a message of rclpy or rosbags.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from amvnet.data.formats.cloud import (
 )
 from amvnet.errors import InputError
 
-CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"  # in ROS 2; rosbags uses this name for ROS 1, too
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"  # ROS 2's name of the type; rosbags' name for ROS 1 also
 
-# NumPy types by their number in a PointField.
+# NumPy types by the number that a PointField has for them.
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
@@ -40,7 +40,7 @@ def read_message(message: Any, name: str) -> Cloud:
         columns[key] = (byte_order + TYPES[field.datatype], field.offset)
     dtype = record_dtype(columns, message.point_step)
 
-    # Rows can have padding, too. Some drivers leave out row_step.
+    # Rows can also have padding. Some drivers do not set row_step.
     row_size = message.width * message.point_step
     row_step = message.row_step or row_size
     size = (message.height - 1) * row_step + row_size

@@ -1,4 +1,4 @@
-"""Scan files that are only rows of numbers, such as those of KITTI and nuScenes."""
+"""Read scan files that are only rows of numbers, such as KITTI's and nuScenes' files."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ XYZ_BYTES = 12  # of rows of nothing but x, y, z
 KITTI_ROWS = RowLayout(NAMES[:KITTI_COLUMNS])
 NUSCENES_ROWS = RowLayout(NAMES)
 
-WIDEST = 8  # bytes of a number
-SAMPLE = 400_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # bytes to look at: whole rows of both layouts
-FEW = 4800  # bytes: the values of smaller files may fit any layout
+WIDEST = 8  # largest size of a number, bytes
+SAMPLE = 400_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # bytes to examine: whole rows of both layouts
+FEW = 4800  # bytes; the values of smaller files may fit any layout
 
-# What tells coordinates and intensities from other columns, and float32 from other types.
-MAX_INTENSITY = 65535  # of any device
-NEAR = 500.0  # metres: coordinates of usual scans are smaller
-USUAL = 0.999  # share of the points that must have such values; the others may be outliers
+# These limits tell coordinates and intensities from other columns, and float32 from other types.
+MAX_INTENSITY = 65535  # largest intensity that any sensor writes
+NEAR = 500.0  # coordinates of usual scans are smaller, metres
+USUAL = 0.999  # least share of the points that must keep these limits; the others are outliers
 NO_INTENSITY = -1.0  # as some tools write for a lost return; no other intensity is negative
 
 
 def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read rows as the user says, or else those of KITTI or nuScenes, whichever the values fit.
+    """Read rows in the user's layout, or else in KITTI's or nuScenes', whichever the values fit.
 
-    A small file that fits neither is nuScenes' if its name ends in `.pcd.bin`, else KITTI's.
+    If a small file fits neither layout, it has nuScenes' layout if its name ends in `.pcd.bin`, and
+    KITTI's otherwise.
 
     Raises:
         InputError: if the file is not a whole number of rows, or the values fit neither layout.
@@ -81,7 +82,7 @@ def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
 
 
 def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
-    """Read a file of nothing but rows of values, as (N, columns) of `dtype`.
+    """Read a file that is only rows of values, as an array (N, columns) of `dtype`.
 
     Raises:
         InputError: if the file is missing, or its size is not a whole number of rows.
@@ -98,7 +99,7 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
 
 
 def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
-    """Return the number of rows that `read_table` would read, from the size of the file."""
+    """Return the number of rows that `read_table` would read, by the size of the file."""
     with readable(path):
         if not path.is_file():
             raise InputError(
@@ -121,7 +122,7 @@ def _usual_layout(data: np.ndarray, is_named: bool) -> RowLayout | None:
 
     Args:
         data: (B,) the bytes of the file.
-        is_named: whether the name says that the columns are those of nuScenes.
+        is_named: whether the file's name says that it has nuScenes' columns.
     """
     if not len(data):
         return None
@@ -138,10 +139,10 @@ def _usual_layout(data: np.ndarray, is_named: bool) -> RowLayout | None:
 
 
 def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
-    """Return whether (N, 5) values can be x, y, z, intensity and ring.
+    """Return whether values (N, 5) can be x, y, z, intensity and ring.
 
-    The ring holds whole numbers, at least two different ones, and the coordinates do not.
-    Intensities are never negative. If not `is_named`, the ring must not look like labels, either.
+    Rings are whole numbers, at least two different ones; coordinates are not all whole. Intensities
+    are never negative. If not `is_named`, the rings must also not look like labels.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]
@@ -155,12 +156,12 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
 
 
 def _is_kitti(table: np.ndarray) -> bool:
-    """Return whether (N, 4) values can be x, y, z and intensity.
+    """Return whether values (N, 4) can be x, y, z and intensity.
 
     Intensities are never negative, but some coordinates are. Values of lost points may not be
     finite.
     """
-    # Column by column: a reduction over rows of three takes several times as long.
+    # Each column is checked alone: a reduction over rows of three takes several times as long.
     x, y, z, intensity = np.ascontiguousarray(table.T)
     is_usual = _are_near(x, y, z) & _are_intensities(intensity)
     is_around = (x < 0).any() or (y < 0).any() or (z < 0).any()

@@ -1,7 +1,7 @@
-"""Read files in a process of its own, with limited memory, time and disk space.
+"""Read files in a separate process with limited memory, time and disk space.
 
-The libraries for packed and indexed formats take whatever a file claims or unpacks to, and some
-abort their process on broken bytes. One such process serves all files, one after the other.
+The libraries for packed and indexed formats take as much memory as a file claims or unpacks to, and
+some abort their process on broken bytes. One separate process reads all files, one after the other.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ try:
 except ImportError:  # Windows has no limits
     resource = None  # type: ignore[assignment]
 
-# Limits, which grow with the bytes of the file.
-MEMORY = 700 << 20  # bytes of the process
-MEMORY_PER_BYTE = 10
-MOST_MEMORY = 4 << 30
-SECONDS = 5.0  # of the processor
-BYTES_PER_SECOND = 3e6
-DISK = 64 << 20  # bytes of a temporary file
-DISK_PER_BYTE = 20
+# The limits grow with the size of the file.
+MEMORY = 700 << 20  # memory of the process for an empty file, bytes
+MEMORY_PER_BYTE = 10  # additional memory for each byte of the file, bytes
+MOST_MEMORY = 4 << 30  # memory of the process for any file, bytes
+SECONDS = 5.0  # processor time for an empty file, seconds
+BYTES_PER_SECOND = 3e6  # bytes of the file for which the process gets an additional second
+DISK = 64 << 20  # size of a temporary file for an empty file, bytes
+DISK_PER_BYTE = 20  # additional size of a temporary file for each byte of the file, bytes
 
-PATIENCE = 0.2  # seconds to wait for the process to end by itself
+STOP_SECONDS = 0.2  # seconds to wait for the process to end by itself
 ADVICE = "copy the file again, or write it again"
 CODE = f"from {__name__} import serve; serve()"
 
@@ -52,11 +52,11 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
 
     Args:
         function: a function of a module that returns arrays and values that JSON can hold.
-        path: the first argument: the file, or a folder of files.
-        arguments: the other arguments, which JSON can hold.
+        path: the first argument of the function: a file, or a folder of files.
+        arguments: the other arguments, which JSON has to hold.
 
     Raises:
-        InputError: if the function raises it, or needs more than the limits.
+        InputError: if the function raises it, or exceeds a limit.
     """
     global _process
     request = {
@@ -74,7 +74,7 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
 
         try:
             values = _process.exchange(request)
-        except BaseException as error:  # an interrupt, too: the next call would get this reply
+        except BaseException as error:  # also an interrupt: the next call would get this reply
             reason = _process.stop()
             _process = None
             if not isinstance(error, (OSError, EOFError)):
@@ -89,26 +89,26 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
 
 
 def size_of(path: Path) -> int:
-    """Return the bytes of a file, or of the files in a folder."""
+    """Return the size of a file, or of all files in a folder, in bytes."""
     if not path.is_dir():
         return path.stat().st_size
     return sum(entry.stat().st_size for entry in path.iterdir() if entry.is_file())
 
 
 class _Process:
-    """The process with limits, as its user sees it."""
+    """The process with limits, seen from the process that uses it."""
 
     def __init__(self) -> None:
         self._folder = Path(mkdtemp(prefix="amvnet-"))
         unfinished.add(self._folder)
         environment = dict(os.environ, TMPDIR=str(self._folder))
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
-        # One thread: each takes some of the memory.
+        # Each thread takes memory, so there is only one.
         environment["OMP_NUM_THREADS"] = "1"
         environment["OPENBLAS_NUM_THREADS"] = "1"
 
-        # In a session of its own: Ctrl-C reaches only its user, which then stops it. If its user
-        # ends, so does the process.
+        # The process has a session of its own: Ctrl-C reaches only the process that uses it, which
+        # then stops it. If the process that uses it ends, it ends as well.
         self._popen = subprocess.Popen(
             [sys.executable, "-P", "-c", CODE],
             env=environment,
@@ -136,10 +136,10 @@ class _Process:
         return values
 
     def stop(self) -> str:
-        """End the process; return in words why it ended if it had already."""
+        """End the process. If it had already ended, return the reason in words."""
         cast(BinaryIO, self._popen.stdin).close()
         try:
-            code = self._popen.wait(PATIENCE)
+            code = self._popen.wait(STOP_SECONDS)
         except subprocess.TimeoutExpired:
             self._popen.kill()
             code = self._popen.wait()
@@ -157,7 +157,7 @@ _lock = Lock()
 
 
 def _forget() -> None:
-    """Forget the process with limits, which belongs to the parent of this forked process."""
+    """Forget the process with limits after a fork: it belongs to the parent."""
     global _process, _lock
     _process = None
     _lock = Lock()
@@ -177,7 +177,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def serve() -> None:
-    """Answer the requests that come by standard input, until it ends."""
+    """Answer the requests that come through standard input, until it ends."""
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries may print, but not between the replies
     if resource is not None:
@@ -185,7 +185,7 @@ def serve() -> None:
 
     for line in sys.stdin.buffer:
         request = json.loads(line)
-        os.chdir(request["folder"])  # the caller may have changed its own
+        os.chdir(request["folder"])  # the caller's folder may have changed
         _set_limits(request["size"])
 
         try:
@@ -195,7 +195,7 @@ def serve() -> None:
         except InputError as error:
             values = {"error": str(error)}
         _send(replies, values)
-        del values  # to free the memory for the next file
+        del values  # frees memory for the next file
 
 
 def _set_limits(size: int) -> None:

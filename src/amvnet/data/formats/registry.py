@@ -1,4 +1,4 @@
-"""The readers of all formats, in this process or in the one with limits."""
+"""Choose the reader of a format, and run it in this process or in the process with limits."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
 from amvnet.errors import InputError, readable
 
-EXTRAS = {"pyarrow": "feather"}  # that install the packages; the others are in `formats`
-OPEN_BAGS = 4  # that the process with limits keeps open
+EXTRAS = {"pyarrow": "feather"}  # extra that installs a package; `formats` installs the others
+OPEN_BAGS = 4  # number of bags that the process with limits keeps open
 
-# By the endings of files: readers that need to know what rows without names hold, and readers of
-# named columns.
+# Readers by the endings of files. The first need to know what rows without names hold; the others
+# read named columns.
 ROW_READERS: dict[str, Callable[[Path, RowLayout], Cloud]] = {
     NUSCENES_ENDING: read_raw,
     ".bin": read_raw,
@@ -54,8 +54,8 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     """Read a file of one scan.
 
     Args:
-        ending: as `ending_of` returns it.
-        layout: what rows of numbers without names hold, as far as the user says it.
+        ending: the ending of the format (`ending_of`).
+        layout: what the user says about rows of numbers without names.
 
     Raises:
         InputError: if the file is broken, or needs a package that is missing.
@@ -71,7 +71,7 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
 
 
 def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
-    """Read some columns of a file of points: for each key a number per point, in any shape.
+    """Read some columns of a file of points. Each has one number per point, in any shape.
 
     Args:
         ending: one of `COLUMN_READERS`.
@@ -99,7 +99,7 @@ def _to_json(layout: RowLayout) -> tuple[list[str], list[str]]:
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
-    """Return a function for each scan of a bag that reads it. Reading in order is fastest.
+    """Return a function for each scan of a bag, which reads the scan. Reading in order is fastest.
 
     `Bag` documents the arguments.
 
@@ -119,7 +119,7 @@ def _read_scan(path: Path, bag: tuple[str, str | None, str], index: int) -> Clou
 
 
 def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any) -> Any:
-    """Call a function that reads a file: in the process with limits, if it needs packages."""
+    """Call a function that reads a file; if it needs packages, in the process with limits."""
     if ending not in PACKAGES:
         return function(path, *arguments)
 
@@ -148,7 +148,11 @@ def read_from_bag(path: Path, index: int, *bag: Any) -> dict[str, Any]:
 
 @lru_cache(OPEN_BAGS)
 def _open(path: Path, ending: str, topic: str | None, _opening: str) -> Bag:
-    """Open a bag, once for each `_opening` by `open_bag`: the file may have changed in between."""
+    """Open a bag once for each `_opening`.
+
+    Each call of `open_bag` has another `_opening`, because the file may have changed since the last
+    call.
+    """
     return Bag(path, ending, topic)
 
 

@@ -1,4 +1,4 @@
-"""Name the columns of numbers without names: as the user says, or in the usual order."""
+"""Name the columns of a table without names: as the user says, or in the usual order."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import numpy as np
 from amvnet.data.formats.cloud import Cloud, find_columns, make_cloud, ring_indices
 from amvnet.errors import InputError
 
-NAMES = ("x", "y", "z", "intensity", "ring")  # of the columns, in the usual order
+NAMES = ("x", "y", "z", "intensity", "ring")  # names of the columns in the usual order
 USUAL_TYPE = "float32"
 ADVICE = "say what the rows hold, for example --columns x,y,z,intensity,ring --dtype float32"
 
-# Measured on whole scans: the largest ring has at most 2.1 times as many points as the mean ring,
-# the largest class at least 2.8 times as many as the mean class. The variance of the elevations
-# within a ring is at most 0.06 of the variance of all, within a class 0.34.
-UNEVEN = 2.5
-FEWEST_LASERS = 8  # fewer classes can have similar numbers of points
-SPREAD = 0.1
+# These limits tell rings from labels. On whole scans, the largest ring has at most 2.1 times as
+# many points as the mean ring; the largest class has at least 2.8 times as many as the mean class.
+# The variance of the elevations within a ring is at most 0.06 of their variance in the scan; within
+# a class it is at least 0.34.
+UNEVEN = 2.5  # most points of a ring, relative to the mean ring
+FEWEST_LASERS = 8  # with fewer values, classes may also have similar numbers of points
+SPREAD = 0.1  # largest variance of the elevations within a ring, relative to the scan's
 
 
 def _is_number(dtype: str) -> bool:
@@ -34,12 +35,12 @@ class RowLayout:
     """What the user says about rows of numbers without names.
 
     Attributes:
-        columns: the name of each column, in order; empty if unknown. Columns whose names mean
-            nothing to the readers, such as "time" or "_", are not read.
-        dtypes: NumPy's names of the types: one for all columns, or one for each.
+        columns: the name of each column, in order; empty if unknown. Columns whose names the
+            readers do not know, such as "time" or "_", are not read.
+        dtypes: NumPy's names of the types: one for all columns, or one for each column.
 
     Raises:
-        InputError: if a coordinate is missing or named twice, a type is unknown, or there are
+        InputError: if a coordinate is missing or named twice; if a type is unknown; or if there are
             several types, but not one for each column.
     """
 
@@ -99,7 +100,7 @@ def describe(columns: Sequence[str]) -> str:
 def named_cloud(
     columns: Sequence[np.ndarray], names: Sequence[str], name: str, note: str = ""
 ) -> Cloud:
-    """Return the cloud of (N,) columns with the names of a `RowLayout`.
+    """Return a cloud from columns (N,) with the names of a `RowLayout`.
 
     Args:
         name: where the scan comes from.
@@ -131,7 +132,7 @@ def named_cloud(
 
 
 def name_columns(table: np.ndarray) -> tuple[str, ...]:
-    """Return names for the columns of an (N, 3 or more) table; "_" if the use is unknown."""
+    """Return names for the columns of a table (N, 3 or more); "_" for an unknown column."""
     count = table.shape[1]
     if _is_color(table[:, 3:6]):
         return (*"xyz", *"_" * (count - 3))
@@ -144,9 +145,10 @@ def name_columns(table: np.ndarray) -> tuple[str, ...]:
 
 @np.errstate(invalid="ignore", over="ignore")
 def are_rings(xyz: np.ndarray, values: np.ndarray) -> bool:
-    """Return whether (N,) values of (N, 3) points are ring indices, and not labels.
+    """Return whether values (N,) of points (N, 3) are ring indices rather than labels.
 
-    Lasers have about as many points as each other, or each has one elevation; classes do not.
+    Lasers have similar numbers of points, or each laser has one elevation. Neither holds for the
+    classes of labels.
     """
     ring = ring_indices(values)
     if ring is None:
@@ -170,7 +172,7 @@ def _split(text: str | None) -> tuple[str, ...]:
 
 
 def _is_color(columns: np.ndarray) -> bool:
-    """Return whether three columns are red, green and blue, 0 to 255."""
+    """Return whether three columns can be red, green and blue, from 0 to 255."""
     if columns.shape[1] != 3:
         return False
     is_byte = (columns == np.round(columns)) & (columns >= 0) & (columns <= 255)

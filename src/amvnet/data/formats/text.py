@@ -1,4 +1,4 @@
-"""Scans in text files: a line of numbers per point."""
+"""Read scans from text files, with a line of numbers for each point."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ from amvnet.data.formats.cloud import (
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
-HEAD = 65_536  # bytes in which the first points must be found
-MOST_COLUMNS = 200
-CHECKED = 20  # lines of points that must have the same columns
-USED = 7  # columns to look at if they have no names
-COMMENTS = ("#", "//", "%")
+HEAD = 65_536  # size of the head of a file, which must hold the first points, bytes
+MOST_COLUMNS = 200  # most columns of a line that are considered
+CHECKED = 20  # number of lines that are checked to have the same columns
+USED = 7  # number of columns that are read if they have no names
+COMMENTS = ("#", "//", "%")  # marks that begin a comment
 # Numbers are ASCII; comments and names of columns may be in any encoding.
 ENCODING = "utf-8-sig"
 CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
-SEPARATORS = (";", ",", None)  # of the values, in the order to try; None is any white space
-# Names of coordinates that other programs write, such as "Points:0" in ParaView and VeloView.
+# Separators of values, in the order to try. None stands for white space.
+SEPARATORS = (";", ",", None)
+# How other programs name coordinates, such as "Points:0" in ParaView and VeloView.
 POINTS = re.compile(r"points?(?:_m_xyz)?[:_](\d)")
-FIRST_RETURN = re.compile(r"([xyz])1")  # "X1 (m)" by ouster-cli
-UNITS = re.compile(r"\s*[\[(].*$")  # as in "x [m]"
+FIRST_RETURN = re.compile(r"([xyz])1")  # ouster-cli writes "X1 (m)"
+UNITS = re.compile(r"\s*[\[(].*$")  # a unit after a name, as in "x [m]"
 EXPECTED = "lines of numbers"
 ADVICE = "write a line x y z intensity per point"
 
@@ -45,10 +46,10 @@ class TextTable:
     """The layout of a text file.
 
     Attributes:
-        separator: between the values of a line; None for any white space.
-        skipped: lines before the first point.
+        separator: the text between the values of a line; None for white space.
+        skipped: the number of lines before the first point.
         count: the number of columns.
-        names: of the columns; empty if the file has none.
+        names: the names of the columns; empty if the file has none.
     """
 
     separator: str | None
@@ -60,15 +61,16 @@ class TextTable:
 def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read a point from each line.
 
-    Columns are found by their names, if a line before the points has them. Otherwise they are x, y,
-    z, intensity and, if its values can be rings, the ring. Values are separated by white space,
-    commas or semicolons.
+    If a line before the points names the columns, they are found by their names. Otherwise they are
+    x, y, z, intensity and, if its values can be rings, the ring. Values are separated by white
+    space, commas or semicolons.
 
     Args:
         layout: what the user says about the rows; only its columns are used.
 
     Raises:
-        InputError: if there are no lines of three or more numbers, or a later line has others.
+        InputError: if there are no lines of three or more numbers, or a later line does not have
+            the same columns.
     """
     with reading(path, EXPECTED, ADVICE):
         table = _require_table(path)
@@ -133,13 +135,14 @@ def _decode(head: bytes) -> str:
 
 
 def _match(lines: list[str], separator: str | None) -> TextTable | None:
-    """Return the layout of the first lines of numbers, if they have this separator."""
+    """Return the layout of a text if this separator separates its numbers, else None."""
     names: tuple[str, ...] = ()
     for skipped, line in enumerate(lines):
         values = _split(line, separator)
         if _are_numbers(values, names):
             points = list(filter(str.strip, lines[skipped : skipped + CHECKED]))
-            # A header is not longer than the points; other text may end in a line of numbers.
+            # A header has fewer lines than there are points. Other text may end in a line of
+            # numbers.
             if len(points) < min(skipped, CHECKED):
                 return None
             for point in points:
@@ -158,7 +161,7 @@ def _match(lines: list[str], separator: str | None) -> TextTable | None:
 
 
 def _split(line: str, separator: str | None) -> list[str]:
-    """Return the values of a line; a separator at its end adds no empty value."""
+    """Return the values of a line. A separator at the end of the line adds no empty value."""
     return line.strip().removesuffix(separator or "").split(separator, MOST_COLUMNS)
 
 
@@ -171,7 +174,7 @@ def _uncomment(line: str) -> str:
 
 
 def _clean_name(name: str) -> str:
-    """Return the name of a column without quotes and units; "x" for "Points:0"."""
+    """Return the name of a column without quotes and units, such as "x" for "Points:0"."""
     bare = UNITS.sub("", name.strip().strip("\"'").strip()).lower()
     first = FIRST_RETURN.fullmatch(bare)
     if first:
@@ -181,7 +184,10 @@ def _clean_name(name: str) -> str:
 
 
 def _are_numbers(values: list[str], names: tuple[str, ...]) -> bool:
-    """Return whether the values of a line are numbers, at least those of the named columns."""
+    """Return whether the values of a line are numbers.
+
+    If the line has the columns `names`, only the values of known columns must be numbers.
+    """
     if len(values) < 3:
         return False
     if len(names) == len(values):
@@ -196,7 +202,7 @@ def _are_numbers(values: list[str], names: tuple[str, ...]) -> bool:
 
 
 def _read_values(path: Path, table: TextTable, indices: range | list[int]) -> np.ndarray:
-    """Return some columns of all points, (N, columns) float64."""
+    """Return some columns of all points as (N, columns) float64."""
     with path.open(encoding=ENCODING, errors="replace") as file:
         values = np.loadtxt(
             islice(file, table.skipped, None),
