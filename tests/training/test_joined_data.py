@@ -24,7 +24,7 @@ from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.record import AS_IS
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.augment import mix
-from amvnet.training.plan import open_parts, sized_by_init, without_mean
+from amvnet.training.plan import open_parts, sized_by_init, without_weight_averaging
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import load, save
 
@@ -190,10 +190,12 @@ def test_the_mean_with_initial_weights_needs_their_classes() -> None:
     assert recipe.training.rv.initial > 0
     lines: list[str] = []
     for init in (None, fresh_weights()):
-        assert without_mean(recipe, init, SEMANTICKITTI, lines.append) is recipe
+        assert without_weight_averaging(recipe, init, SEMANTICKITTI, lines.append) is recipe
     assert not lines
 
-    training = without_mean(recipe, fresh_weights(NUSCENES), SEMANTICKITTI, lines.append).training
+    training = without_weight_averaging(
+        recipe, fresh_weights(NUSCENES), SEMANTICKITTI, lines.append
+    ).training
     assert training.rv.initial == training.bev.initial == 0
     assert training.rv.lr == recipe.training.rv.lr
     assert [line.split(":")[0] for line in lines] == ["rv", "bev"]

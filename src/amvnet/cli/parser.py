@@ -200,11 +200,11 @@ def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
     arguments = []
     for name in inspect.signature(run).parameters:
         kind = hints[name]
-        if _is_bundle(kind):
+        if name in values:  # also a recipe, which is a dataclass with options of its own
+            arguments.append(values[name])
+        else:
             own = {field.name: values[field.name] for field in dataclasses.fields(kind)}
             arguments.append(kind(**own))
-        else:
-            arguments.append(values[name])
     run(*arguments)
 
 

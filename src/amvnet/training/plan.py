@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.joined import join
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
@@ -80,6 +82,38 @@ class Plan:
                 f"found {taxonomy}; use the recipe of that benchmark"
             )
 
+    @classmethod
+    def open(
+        cls,
+        recipe: Recipe,
+        data: Sequence[str],
+        out: Path,
+        choose: Callable[[Dataset], TrainingScans],
+        init: Weights | None = None,
+        *,
+        say: Say = say_nothing,
+        **settings: Any,
+    ) -> Plan:
+        """Open the datasets of a training run, and return its plan.
+
+        Args:
+            recipe: what to train; sizes and classes come from `init` if the recipe says so.
+            data: datasets as `open_dataset` takes them. The training scans of the second and later
+                ones are mixed in.
+            choose: returns the scans of the first dataset to train on and to validate with.
+            init: weights to begin with.
+            settings: further attributes of the plan.
+
+        Raises:
+            InputError: if a dataset cannot be opened or mixed in, the recipe needs `init`, or the
+                scans do not fit the recipe.
+        """
+        recipe = sized_by_init(recipe, init)
+        dataset, others = open_parts(data, recipe, out, init)
+        recipe = without_weight_averaging(recipe, init, dataset.taxonomy, say)
+        scans = join(choose(dataset), others, recipe.training.others)
+        return cls(recipe, scans, out, say=say, **settings)
+
     def build(self, weights: Weights) -> AMVNet:
         """Return the model of some weights; parts that they lack are initialised at random.
 
@@ -114,10 +148,12 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
     )
 
 
-def without_mean(recipe: Recipe, init: Weights | None, classes: Taxonomy, say: Say) -> Recipe:
-    """Return a recipe whose networks are no mean with initial weights that have other classes.
+def without_weight_averaging(
+    recipe: Recipe, init: Weights | None, classes: Taxonomy, say: Say
+) -> Recipe:
+    """Return a recipe that averages no weights with initial weights for other classes.
 
-    Their last layers would be new, and of no use in a mean.
+    The last layers of such weights are new, and of no use in an average.
     """
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from amvnet.cli.console import on_terminal, say, say_lines
 from amvnet.cli.options import TrainingChoice, describe_records, join_processes
+from amvnet.config.schema import Recipe
 
 TABLE = "ablation"  # name of the table, without an ending
 
 
 def ablate(
-    recipe: Any,
+    recipe: Recipe,
     /,
     data: str,
     out: Path,
@@ -34,17 +34,25 @@ def ablate(
     from amvnet.runtime.distributed import device_of
     from amvnet.training.ablation import ablate as ablate_recipe
     from amvnet.training.ablation import is_begun
-    from amvnet.training.plan import Plan, open_for_training
+    from amvnet.training.plan import Plan
 
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
-    dataset = open_for_training(data, recipe, out)
-    scans = choice.scans(dataset)
+    plan = Plan.open(
+        recipe,
+        [data],
+        out,
+        choose=choice.scans,
+        say=say,
+        resume=True,
+        bars=on_terminal(),
+        processes=processes,
+    )
+    scans = plan.scans
     say(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
 
     table = {out / f"{TABLE}.csv": charts.TABLE}
     check_outputs(table, [data], overwrite=is_begun(out))
     processes.wait()
-    plan = Plan(recipe, scans, out, resume=True, say=say, bars=on_terminal(), processes=processes)
     rows = list(ablate_recipe(plan, device))
     if processes.first:
         files = charts.write_ablation(rows, out / TABLE)

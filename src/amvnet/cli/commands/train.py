@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from amvnet.cli.console import on_terminal, say
 from amvnet.cli.options import ScoresChoice, TrainingChoice, describe_records, join_processes
+from amvnet.config.schema import Recipe
 
 
 def train(
-    recipe: Any,
+    recipe: Recipe,
     /,
     data: list[str],
     out: Path,
@@ -42,32 +43,30 @@ def train(
         with_val: train on the scans to validate with, too, as for a benchmark's server; then
             nothing is validated.
     """
-    from amvnet.data.datasets.joined import join
     from amvnet.models.methods import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
-    from amvnet.training.plan import Plan, open_parts, sized_by_init, without_mean
+    from amvnet.training.plan import Plan
     from amvnet.training.run import train as train_stages
     from amvnet.weights.file import load
 
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     weights = None if init is None else load(init)
-    recipe = sized_by_init(recipe, weights)
-    dataset, others = open_parts(data, recipe, out, weights)
-    recipe = without_mean(recipe, weights, dataset.taxonomy, say)
-    scans = join(choice.scans(dataset, with_val), others, recipe.training.others)
-    say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
-
-    plan = Plan(
+    plan = Plan.open(
         recipe,
-        scans,
+        data,
         out,
-        resume=resume,
+        choose=lambda dataset: choice.scans(dataset, with_val),
+        init=weights,
         say=say,
+        resume=resume,
         bars=on_terminal(),
         processes=processes,
         scores=models.parse(),
         also_read=(*data, init),
     )
+    scans = plan.scans
+    say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
+
     path = train_stages(plan, stage, weights)
     line = f"weights in {path}"
     parts = load(path).parts
