@@ -216,7 +216,7 @@ def test_a_recipe_counts_wherever_it_stands(
 
     def record(plan: Plan, *_: object) -> Path:
         plans.append(plan)
-        return tmp_path
+        return world / "w.safetensors"
 
     monkeypatch.setattr(training_run, "train", record)
     recipe = f"{world}/recipe.yaml"

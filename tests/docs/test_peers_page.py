@@ -44,7 +44,7 @@ def program(package: str, world: Path) -> dict[str, Any]:
 
 def iou_of(options: str, world: Path, method: str = "amvnet") -> np.ndarray:
     """Return the IoU of each class that `evaluate` writes, NaN if there is nothing to count."""
-    succeed(f"evaluate {world}/dataset --sequences 08 {options} --json iou.json")
+    succeed(f"evaluate {world}/dataset --sequences 08 {options} --json iou.json --overwrite")
     iou = json.loads(Path("iou.json").read_text())["methods"][method]["iou"]
     return np.array([iou[name] for name in SEMANTICKITTI.classes], float)
 

@@ -126,7 +126,7 @@ def project_to_grid(*scans: Scan) -> PolarGrid:
 
 def assert_equals_the_loop(scan: Scan, config: RangeViewConfig) -> None:
     view = project_to_image(scan, config)
-    pixels, nearest, image = range_view_by_loop(scan, config)
+    pixels, nearest, image = range_view_by_loop(scan.select(scan.valid), config)
 
     assert view.pixel.tolist() == pixels
     assert view.nearest.tolist() == nearest
@@ -279,7 +279,7 @@ def test_rows_by_ring_without_a_ring_is_an_input_error() -> None:
 
 def assert_polar_equals_the_loop(scan: Scan) -> None:
     grid = project_to_grid(scan)
-    cells, features = polar_view_by_loop(scan, POLAR)
+    cells, features = polar_view_by_loop(scan.select(scan.valid), POLAR)
     radius, angle, voxel = np.reshape(np.array(cells, np.int64), (-1, 3)).T
     pillars = radius * 17 + angle
     assert grid.pillar.tolist() == pillars.tolist()

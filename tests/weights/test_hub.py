@@ -138,7 +138,7 @@ def test_the_card_says_what_the_hub_and_people_need(hub: Hub) -> None:
     assert "traffic-sign" in card
     assert "sensor tiny" in card
     assert "| 50.0 |" in card
-    assert "seed: 0" in card
+    assert "| seed | 0 |" in card
     assert "cc-by-nc-sa-4.0" in card
 
 
