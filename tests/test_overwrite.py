@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shlex
 import shutil
@@ -230,6 +231,28 @@ def test_no_output_is_an_input(name: str, is_hard: bool, world: Path, tmp_path: 
     assert str(link) in line
     assert contents(world) == before
     assert files(tmp_path) == {output}
+
+
+@pytest.mark.parametrize("labels", [".label", "../truth/{name}.label"])
+def test_the_users_labels_are_not_replaced_by_those_of_other_classes(
+    labels: str, world: Path, tmp_path: Path
+) -> None:
+    """Labels of other classes are not read. They are inputs all the same."""
+    scan = tmp_path / "scans/a.bin"
+    scan.parent.mkdir()
+    shutil.copy(world / "scans/a.bin", scan)
+    own = scan.parent / labels.replace("{name}", "a") if "/" in labels else scan.with_suffix(labels)
+    own.parent.mkdir(exist_ok=True)
+    own.resolve().write_bytes(LABELS)
+    if "/" in labels:  # the place of the output is a link to the labels
+        (tmp_path / "scans/a.label").symlink_to(own.resolve())
+    description = {"classes": {"ground": 3}, "scans": "scans/*.bin", "labels": labels}
+    (tmp_path / "own.yaml").write_text(json.dumps(description))
+
+    before = contents(tmp_path)
+    command = f"predict {tmp_path}/own.yaml {WEIGHTS} --out {tmp_path} --overwrite"
+    assert "a.label: expected an output that is no input" in refusal(command.format(world=world))
+    assert contents(tmp_path) == before
 
 
 def test_a_scan_is_not_replaced_by_its_page(world: Path, tmp_path: Path) -> None:

@@ -277,6 +277,17 @@ def test_label_files_that_match_the_pattern_of_scans_are_no_scans(tmp_path: Path
     np.testing.assert_array_equal(labels, EXPECTED)
 
 
+def test_label_files_are_no_scans_for_weights_of_other_classes_either(tmp_path: Path) -> None:
+    """They match the pattern of the scans, and are not read."""
+    (tmp_path / "site").mkdir()
+    np.save(tmp_path / "site/a.npy", some_points())
+    np.save(tmp_path / "site/a.truth.npy", RAW)
+    data = open_own(str(describe(tmp_path, labels=".truth.npy"))).with_classes(SEMANTICKITTI)
+    (record,) = data.records(data.sequences("all"))
+    assert record.name == "site/a"
+    assert data.read(record).labels is None
+
+
 def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> None:
     np.save(site / "a.npy", some_points())
     data = open_own(describe(tmp_path))

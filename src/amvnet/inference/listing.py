@@ -84,8 +84,7 @@ class DatasetScan:
     @property
     def files(self) -> list[Path]:
         """The files of its points and its labels."""
-        labels = self.record.labels_path
-        return [self.path] if labels is None else [self.path, labels]
+        return self.dataset.files_of(self.record)
 
     def labels_path(self, kind: str) -> Path:
         """Return the path of the file of its labels, relative to a folder of predictions."""

@@ -152,6 +152,11 @@ class Dataset(ABC):
         """Return those of some scans that have labels, which may be none."""
         return [record for record in records if record.has_labels]
 
+    def files_of(self, record: ScanRecord) -> list[Path]:
+        """Return the files of a scan: its points and labels, which no output may replace."""
+        files = (record.points_path, record.labels_path)
+        return [path for path in files if path is not None]
+
     def read_unchanged(self, record: ScanRecord) -> Scan:
         """Read the points of one scan as in its file; raise the errors of `read`."""
         return self.read(record, labels=False)

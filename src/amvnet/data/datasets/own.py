@@ -66,6 +66,7 @@ class Description:
         taxonomy: the classes.
         scans: pattern of the scan files.
         labels: where the labels are; None if there are none.
+        reads_labels: whether the labels are read; not if they have other classes than `taxonomy`.
         split: names of folders and scans, and patterns, by split; empty if there is no split.
         sensor: name or attributes of the sensor; None if it is to be measured.
         layout: what rows of numbers without names hold.
@@ -76,6 +77,7 @@ class Description:
     taxonomy: Taxonomy
     scans: str
     labels: LabelPlace | None = None
+    reads_labels: bool = True
     split: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sensor: str | Mapping[str, Any] | None = None
     layout: RowLayout = UNKNOWN
@@ -151,7 +153,9 @@ class OwnScans(Dataset):
         if records and not labelled:
             place = self.description.labels
             found = "no labels in the description"
-            if place is not None:
+            if not self.description.reads_labels:
+                found = f"no labels of the classes of {self.taxonomy.name}"
+            elif place is not None:
                 scan = self._scans[records[0].name]
                 path = os.path.normpath(place.path_of(scan.path, scan.name))
                 found = f"no {path}"
@@ -211,9 +215,18 @@ class OwnScans(Dataset):
         return recordings
 
     def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
-        """Return the scans for predictions of other classes, without their labels."""
-        description = dataclasses.replace(self.description, taxonomy=taxonomy, labels=None)
+        """Return the scans for predictions of other classes; their labels are not read."""
+        description = dataclasses.replace(self.description, taxonomy=taxonomy, reads_labels=False)
         return OwnScans(description, self.normalise)
+
+    def files_of(self, record: ScanRecord) -> list[Path]:
+        """Return the files of a scan: its labels are the user's even if they are not read."""
+        files = super().files_of(record)
+        place = self.description.labels
+        if place is not None:
+            scan = self._scans[record.name]
+            files.append(place.path_of(scan.path, scan.name))
+        return files
 
     @cached_property
     def _scans(self) -> dict[str, NamedScan]:
@@ -281,7 +294,7 @@ class OwnScans(Dataset):
                 name=name,
                 sequence=sequence,
                 points_path=scan.path,
-                labels_path=labels_path if has_labels else None,
+                labels_path=labels_path if has_labels and self.description.reads_labels else None,
                 prediction=f"{name}.label",
             )
             listing.append((record, splits[name]))
