@@ -86,7 +86,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """Yield a new folder, which is removed at the end, also if the process exits at once.
 
     Args:
-        parent: the folder that it is made in; None means the system's for temporary files.
+        parent: the folder that it is made in; by default the system's folder for temporary files.
     """
     if parent is None:
         folder = Path(tempfile.mkdtemp(prefix="amvnet-"))

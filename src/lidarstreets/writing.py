@@ -107,7 +107,7 @@ def simulate(
         done += written
         progress(done, scans * sequences)
 
-    # The layout's tables cover all sequences in the folder, also those of earlier calls.
+    # The layout's tables cover all sequences in the folder, also the sequences of earlier calls.
     markers = sorted((out / MARKERS).glob("*.json"))
     rows = [json.loads(path.read_text())["rows"] for path in markers]
     layout.complete(out, rows)

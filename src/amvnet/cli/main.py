@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line, and print an error as one line to stderr.
 
     Args:
-        argv: the verb and its arguments; None means those of this process.
+        argv: the command and its arguments; by default the arguments of this process.
 
     Returns:
         The exit code: 0 if done, 2 if the input is wrong, 3 if only some of the inputs are broken,

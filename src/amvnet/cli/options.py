@@ -91,7 +91,7 @@ class TrainingChoice:
     """Which scans to train on and to validate with."""
 
     train_sequences: tuple[str, ...] | None = None
-    """sequences or scenes, separated by commas, to train on; default: those of the split."""
+    """sequences or scenes, separated by commas, to train on; default: the split's."""
     val_sequences: tuple[str, ...] | None = None
     """sequences or scenes, separated by commas, to validate with; default: those of the split, or
     without a split the last one."""
@@ -172,7 +172,7 @@ class LabelChoice:
     format: FormatName = "label"
     """of scan files' labels: raw ids alone (label, npy), or coloured points (ply)."""
     classes: str | None = None
-    """write the ids of these classes, to which those of the weights are mapped: coarse, or a YAML
+    """write the ids of these classes, to which the weights' classes are mapped: coarse, or a YAML
     file."""
     scores: bool = False
     """also write the probabilities of both networks."""
@@ -276,7 +276,7 @@ def join_processes(cuda: bool = False) -> Processes:
 
 
 def describe_records(records: Sequence[ScanRecord]) -> str:
-    """Return in words how many scans there are, and of which sequences."""
+    """Return in words how many scans there are, and from which sequences."""
     if not records:
         return "none"
     names = sorted({record.sequence for record in records})

@@ -143,7 +143,7 @@ def _item_kind_of(kind: Any) -> Any:
 
 
 def _parts_of(kind: Any) -> Iterator[Any]:
-    """Yield a type and its parts; those of `Count | None` include int and a `Range`."""
+    """Yield a type and its parts; `Count | None` has int and a `Range` among its parts."""
     yield kind
     for part in get_args(kind):
         yield from _parts_of(part)

@@ -115,7 +115,8 @@ def _export(weights: Weights, int8: str | None, folder: Path) -> dict[str, bytes
 def _publish(part: Path, folder: Path, weights: Weights) -> None:
     """Give a finished folder its name, unless another process has exported the same.
 
-    A folder of that name with other files is replaced. Without success the cache stays as it is.
+    A folder of that name with other files is replaced. If the export fails, the cache does
+    not change.
     """
     for _ in range(ATTEMPTS):
         with suppress(OSError):

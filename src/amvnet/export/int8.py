@@ -131,7 +131,7 @@ def _read(text: str, weights: Weights) -> list[Scan]:
 def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarray:
     """Return the column of the largest score, 0..K - 1, for the finite points of all scans.
 
-    The scores are those of the network that the graph `name` is a part of.
+    The network that the graph `name` is a part of gives the scores.
     """
     labels = []
     for scan in scans:

@@ -46,7 +46,7 @@ class Fusion:
             head = load(head)
         self._intensity = None
         if isinstance(head, Weights):
-            # The head sees the intensities, too.
+            # The head also sees the intensities.
             self._intensity = trained_intensity(head.training, head.sensor)
             tau = head.model.assertion.threshold if tau is None else tau
             head = head.build_head()
@@ -128,7 +128,7 @@ class Fused(NamedTuple):
     Attributes:
         files: the number of label files.
         uncertain: the share of the points on which the two models disagree, in [0, 1].
-        silent: the share of the points of which a model has no opinion, in [0, 1], by its side.
+        silent: by side, the share of the points about which its model has no opinion, in [0, 1].
     """
 
     files: int
@@ -151,8 +151,8 @@ def fuse_files(
 
     Args:
         head: weights with a point head; None gives the ensemble.
-        tau: threshold of the cosine similarity; None means the head's, or else the paper's.
-        taxonomy: the classes if there is no head; None means those of the inputs.
+        tau: threshold of the cosine similarity; by default the head's, or else the paper's.
+        taxonomy: the classes if there is no head; by default the classes of the inputs.
 
     Raises:
         InputError: before anything is written, if scores of a scan are missing or a file of the
@@ -172,7 +172,7 @@ def fuse_files(
     output = replace(output, also_read=[*output.also_read, *scores])
 
     fusion = Fusion(head, tau)
-    silent: Counter[str] = Counter()  # points of which a model has no opinion, by its side
+    silent: Counter[str] = Counter()  # by side, points without an opinion
 
     def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
         results = []

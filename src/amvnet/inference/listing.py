@@ -33,9 +33,9 @@ class ScanOptions:
     """Which scans of the inputs to use.
 
     Attributes:
-        sequences: of datasets, these sequences or scenes; None means those of `split`.
+        sequences: of datasets, these sequences or scenes; by default the sequences of `split`.
         split: of datasets, the official split.
-        topic: of bags; None means the only topic with scans.
+        topic: of bags; by default the only topic with scans.
         layout: of rows of numbers without names, what they hold.
     """
 
@@ -63,7 +63,7 @@ class DatasetScan:
     """A scan of a dataset, not read yet; its labels are in the dataset's format and classes.
 
     Attributes:
-        written: the classes of the labels that are written; None means those of the dataset.
+        written: the classes of the labels that are written; by default the classes of the dataset.
         name: for messages, unique among the scans of one input.
         title: a short name for people who look at the scan.
         source: the recording that it is from: a sequence, a bag or a folder.
@@ -155,7 +155,7 @@ class FileReader:
         return LoadedScan(self.normaliser(cloud, scan.source), cloud.xyz)
 
     def _read_and_keep(self, scan: NamedScan) -> Cloud:
-        """Read one of the first scans of a source, and forget those of others."""
+        """Read one of the first scans of a source, and forget the scans of other sources."""
         if any(source != scan.source for source, _ in self._clouds):
             self._clouds.clear()
         cloud = scan.read()
@@ -164,7 +164,7 @@ class FileReader:
 
 
 class FileScan:
-    """A scan in a file or a bag, not read yet; its attributes are those of `DatasetScan`."""
+    """A scan in a file or a bag, not read yet; it has the attributes of `DatasetScan`."""
 
     def __init__(self, scan: NamedScan, reader: FileReader) -> None:
         self.scan = scan
@@ -308,7 +308,7 @@ def read(path: Path | str, topic: str | None = None) -> Scan:
 
     Args:
         path: a scan file of any supported format, or a bag.
-        topic: of bags; None means the only topic with scans.
+        topic: of bags; by default the only topic with scans.
 
     Raises:
         InputError: if the file is missing, broken, of another format, or holds several scans.
@@ -326,7 +326,7 @@ def read_all(path: Path | str, topic: str | None = None) -> Scans:
 
     Args:
         path: as INPUT of `amvnet predict`.
-        topic: of bags; None means the only topic with scans.
+        topic: of bags; by default the only topic with scans.
 
     Returns:
         A sequence that reads each scan when it is asked for, as `read` does.

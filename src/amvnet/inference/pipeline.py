@@ -149,7 +149,7 @@ class Pipeline:
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
     def _check_output(self, earlier: Mapping[str, Entry]) -> None:
-        """Raise InputError if a file may not be written: only those of `earlier` are replaced."""
+        """Raise InputError if a file may not be written: only files of `earlier` are replaced."""
         folder = self.output.folder
         _check_names(self.scans)
         inputs = list(self.output.also_read)
@@ -205,7 +205,7 @@ class Pipeline:
     def stream(
         self, scans: Sequence[InputScan], write: Callable[[Outcome], Written], writers: int = 1
     ) -> Iterator[Written]:
-        """Read, segment and write scans, of which only a few are in memory at a time.
+        """Read, segment and write scans; only a few are in memory at a time.
 
         Args:
             write: takes each outcome in order; only scans that cannot be read may come earlier.

@@ -58,7 +58,7 @@ def predict(
             are, if there are two networks.
 
     Returns:
-        The number of label files of these scans, with those of the run that is resumed.
+        The number of label files of these scans, with the files of the run that is resumed.
 
     Raises:
         InputError: before anything is written, if an input is missing, its folder is that of the

@@ -48,8 +48,8 @@ def array_scan(
             fields of these names, in any order and shape, such as `read_points` of ROS returns.
             Anything that `as_array` takes may stand for an array.
         columns: their names in order, separated by commas; others than x, y, z, intensity and ring
-            are left out. None means the names of the fields, or else these in this order, the ring
-            if the values suggest it.
+            are left out. By default the names of the fields, or else x, y, z, intensity in this
+            order, and the ring if the values suggest it.
         trained: fills in the intensities if there are none, which a warning says.
 
     Raises:

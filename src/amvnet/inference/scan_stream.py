@@ -29,7 +29,7 @@ def stream_groups(
     batch: int = 1,
     at_once: int = 1,
 ) -> Generator[Result]:
-    """Read scans and compute on groups of them, of which only a few are in memory at a time.
+    """Read scans and compute on groups of them; only a few are in memory at a time.
 
     Args:
         load: reads a scan; called in one other thread, in the order of the records.

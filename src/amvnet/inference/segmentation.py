@@ -260,7 +260,7 @@ def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> 
 
     Args:
         valid: (N,) bool, the scan's valid points.
-        labels, scores: those of all points in the batch.
+        labels, scores: of all points in the batch.
         points: the places of the valid points in the batch.
     """
     return Segmentation(

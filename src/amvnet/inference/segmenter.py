@@ -140,7 +140,7 @@ class Segmenter:
 
         Args:
             path: as INPUT of `amvnet predict`.
-            topic: of bags; None means the only topic with scans.
+            topic: of bags; by default the only topic with scans.
 
         Returns:
             An iterator that reads and segments one scan at a time.
@@ -175,7 +175,7 @@ class Segmenter:
     def batch(self, scans: Sequence[Scan]) -> PointBatch:
         """Return the valid points of some scans on the device, as the networks take them.
 
-        The intensities of each scan are matched to those of the training, if the weights say so.
+        The intensities of each scan are matched to the training's, if the weights say so.
         If the rows of the range image are lasers, they are looked for in scans without rings.
 
         Raises:

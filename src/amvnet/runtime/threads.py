@@ -79,7 +79,7 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
 
 @contextmanager
 def thread_pool(workers: int, threads_each: int) -> Iterator[ThreadPoolExecutor]:
-    """Yield a pool of threads, each of which computes with `threads_each` of torch's threads."""
+    """Yield a pool of threads; each computes with `threads_each` of torch's threads."""
     import torch
 
     threads = torch.get_num_threads()

@@ -238,7 +238,7 @@ class Normaliser:
 def _intensity_map(
     cloud: Cloud, quantiles: np.ndarray | None, sensor: Sensor, expected: Expectation
 ) -> IntensityMap:
-    """Return how the intensities of a scan become those of the training."""
+    """Return how the intensities of a scan become like the training's."""
     known_scale = sensor.intensity_scale
     scale = known_scale or 1.0
     if known_scale is None and quantiles is not None:

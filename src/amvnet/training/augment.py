@@ -70,7 +70,7 @@ def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
     """Replace a sector of a scan with the same sector of another scan (Xiao et al., 2022).
 
     The sector spans a quarter to three quarters of the circle. A scan that would have no point left
-    is returned as it is.
+    is returned unchanged.
     """
     start = rng.uniform(-np.pi, np.pi)
     width = rng.uniform(0.5, 1.5) * np.pi
@@ -85,7 +85,7 @@ def mix_lasers(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
     """Replace every second band of elevation with that of another scan (Kong et al., 2023).
 
     The bands are equally high and cover both scans. A scan that would have no point left is
-    returned as it is.
+    returned unchanged.
     """
     bands = int(rng.integers(BANDS[0], BANDS[1] + 1))
     first = int(rng.integers(2))
@@ -125,7 +125,7 @@ def disturb(scores: Tensor, points: Tensor, rng: np.random.Generator) -> Tensor:
 
     All probabilities are softened by one softmax temperature. Then a part of the probability of
     some classes goes to another class, more in some directions and at some ranges than in others.
-    So the head learns not to trust the networks as far as on scans like those of their training.
+    So the head learns to trust the networks less than on scans like the scans of their training.
 
     Args:
         scores: (P, K) probabilities, as is the result.

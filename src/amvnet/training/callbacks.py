@@ -24,7 +24,7 @@ from amvnet.weights.file import Weights, part_state, save
 class AverageWeights(Callback):
     """Keeps an exponential moving average of the weights, which is validated and written.
 
-    The statistics of batch norms are averaged, too. The training itself goes on with its own
+    The statistics of batch norms are averaged as well. The training itself goes on with its own
     weights.
 
     Args:
@@ -56,7 +56,7 @@ class AverageWeights(Callback):
             self.average = _copies(weights)
             self.initial = _copies(weights) if self.initial_share else {}
 
-        # Those of a checkpoint are in the CPU's memory.
+        # The weights of a checkpoint are in the CPU's memory.
         for tensors in (self.initial, self.average):
             for name in tensors:
                 tensors[name] = tensors[name].to(weights[name].device)

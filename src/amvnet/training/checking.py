@@ -70,7 +70,7 @@ def keep_counts(plan: Plan, counts: np.ndarray) -> None:
 def _datasets_of(
     plan: Plan,
 ) -> Iterator[tuple[Dataset, Mapping[str, Sequence[ScanRecord]], Sequence[ScanRecord]]]:
-    """Yield each dataset of a training, its scans by split, and those of the first epoch."""
+    """Yield each dataset of a training, its scans by split, and the scans of the first epoch."""
     scans = plan.scans
     joined = scans.dataset
     if not isinstance(joined, Joined):

@@ -27,7 +27,7 @@ VAL_FACTOR = 64  # a validation batch is as large as this many training batches
 class HeadStage(Stage):
     """Stage `head`: it learns from scores gathered beforehand, so that the networks stay frozen.
 
-    The arguments that are not named here are those of `Stage`.
+    `Stage` documents the other arguments.
 
     Args:
         train, val: the points to train and to validate with; None for no validation.

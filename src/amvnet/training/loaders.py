@@ -46,7 +46,7 @@ class ScanSet(data.Dataset[Scan]):
     """Labelled scans by epoch and index.
 
     The augmentation depends only on seed, epoch and index: it is the same on any number of
-    processes. Augmented scans are those of the epoch (`Dataset.at_epoch`).
+    processes. Augmented scans belong to the epoch (`Dataset.at_epoch`).
 
     Args:
         augment: how they are augmented, or None for scans as they are.

@@ -41,7 +41,7 @@ REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 class NetworkStage(Stage):
     """The base of the two networks' stages, which learn from batches of scans by AdamW.
 
-    A subclass defines `logits`. The arguments that are not named here are those of `Stage`.
+    A subclass defines `logits`. `Stage` documents the other arguments.
 
     Args:
         view, net: the projection, and the network on it.
@@ -65,7 +65,7 @@ class NetworkStage(Stage):
         self.class_weights: Tensor | None
         tensor = None if weights is None else torch.from_numpy(weights)
         self.register_buffer("class_weights", tensor, persistent=False)
-        # Batches of the epoch, and those of them with a label to learn from.
+        # Batches of the epoch, and how many of them have a label to learn from.
         self.batches = 0
         self.labelled: Tensor | int = 0
 

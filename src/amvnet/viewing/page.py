@@ -374,6 +374,6 @@ def _json(tree: Any) -> str:
 def _fill(template: str, parts: Mapping[str, str]) -> str:
     """Replace each @@NAME@@ of a template by the part of that name.
 
-    The parts themselves are not searched: an @@NAME@@ within one stays as it is.
+    The parts themselves are not searched: an @@NAME@@ within a part stays unchanged.
     """
     return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], template)

@@ -43,7 +43,7 @@ USUAL_UNCERTAIN = 0.2
 # Types of parameters, and of counts among them, by safetensors' names.
 FLOATS = ("F16", "BF16", "F32", "F64")
 COUNTS = ("I64",)
-LONGEST = 10_000_000  # characters of a description; those of the built-in weights have 6,000
+LONGEST = 10_000_000  # characters of a description; the built-in ones have 6,000
 MOST_PARAMETERS = 500_000_000  # of a model; that of the paper has about 60 million
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
@@ -195,7 +195,7 @@ class Weights:
     def resized(self, name: str, model: ModelConfig) -> Weights:
         """Return these weights with the sizes of one part taken from another configuration.
 
-        The parameters stay as they are: replace them, too, before building the model.
+        The parameters stay unchanged: replace them as well before building the model.
         """
         sizes = {key: getattr(model, key) for key in SIZES[name]}
         return dataclasses.replace(self, model=dataclasses.replace(self.model, **sizes))

@@ -286,7 +286,7 @@ def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> 
     change = rng.choice([0.1, 0.5])
     filled = rng.choice([0.85, 1.0])
 
-    # What lies under and behind undergrowth is called vegetation, too.
+    # What lies under and behind undergrowth is also called vegetation.
     if rng.random() < 0.7:
         plot.overgrow(distance - rng.uniform(0.2, 1.5), distance + rng.uniform(1, 10))
 

@@ -45,7 +45,7 @@ def demo(
             f"simulated streets have, found {', '.join(classes)[:200]}; use amvnet view and "
             "amvnet evaluate on scans with these classes"
         )
-    # Scans of another seed in the same folder would be taken for those of this one.
+    # Scans of another seed in the same folder would be taken for this seed's.
     data = out / "data" / f"{sensors[0]}-{seed}"
     with progress("simulating") as step:
         simulate(

@@ -28,7 +28,7 @@ def submit(
         out: the archive to write, NAME.zip.
         split: the official split; the servers score test, the others are for trials.
         sequences: sequences or scenes instead, separated by commas, for trials.
-        use_external: nuScenes: the method learnt from data that are not of nuScenes, too.
+        use_external: nuScenes: the method also learnt from data outside nuScenes.
         overwrite: replace the archive if it exists.
     """
     from amvnet.data.datasets.open import open_dataset

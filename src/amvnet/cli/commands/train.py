@@ -40,7 +40,7 @@ def train(
             other classes, all layers but the last ones are taken. Stages that the folder already
             has keep their own weights.
         resume: continue an earlier run in the folder.
-        with_val: train on the scans to validate with, too, as for a benchmark's server; then
+        with_val: also train on the scans to validate with, as for a benchmark's server; then
             nothing is validated.
     """
     from amvnet.models.methods import BOTH_NETWORKS

@@ -1,1 +1,1 @@
-"""Datasets: those of both benchmarks, simulated streets, and a user's own scans."""
+"""Both benchmarks, simulated streets, and a user's own scans as datasets."""

@@ -74,7 +74,7 @@ class Dataset(ABC):
         return bool(self._on_disk("train") and self._on_disk("val"))
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of a split, which are those of every command.
+        """Return the sequences of a split; every command uses these.
 
         Without an official split, the last sequence validates and the others train. Sequences of
         the test split do neither, nor do those without labels if others have labels. If only the
@@ -149,7 +149,7 @@ class Dataset(ABC):
         return labelled
 
     def having_labels(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
-        """Return those of some scans that have labels, which may be none."""
+        """Return the scans that have labels, which may be none."""
         return [record for record in records if record.has_labels]
 
     def files_of(self, record: ScanRecord) -> list[Path]:
@@ -205,7 +205,7 @@ class Dataset(ABC):
         """Write (N,) train ids as raw ids; the file appears whole or not at all.
 
         Args:
-            taxonomy: the classes of the prediction; None means those of the dataset.
+            taxonomy: the classes of the prediction; by default the classes of the dataset.
             count: N, if it is known; else it is read from the scan's file.
 
         Raises:

@@ -29,7 +29,7 @@ class MixedRecord(ScanRecord):
 
     Attributes:
         member: index of the dataset among all, 1 for the first that is mixed in.
-        place: index of the place among those of the dataset.
+        place: index of the place among the dataset's places.
         original: the scan that takes the place.
     """
 

@@ -190,7 +190,7 @@ class NuScenes(Dataset):
         taxonomy: Taxonomy | None = None,
         count: int | None = None,
     ) -> Path:
-        """Write train ids, none of which is 0: the benchmark's server refuses points without one.
+        """Write train ids without a 0: the benchmark's server refuses points without a class.
 
         Lost returns get the most frequent class of the scan.
         """

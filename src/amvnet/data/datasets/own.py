@@ -208,7 +208,7 @@ class OwnScans(Dataset):
         return self._counts[record.name]
 
     def recordings(self) -> dict[str, list[NamedScan]]:
-        """Return the scans of each recording, in order: those of one folder and ending."""
+        """Return the scans of each recording, in order; each has one folder and one ending."""
         recordings: dict[str, list[NamedScan]] = {}
         for scan in self._scans.values():
             recordings.setdefault(scan.source, []).append(scan)
@@ -244,7 +244,7 @@ class OwnScans(Dataset):
             ) from None
         paths = [path for path in matches if path.is_file() and not path.name.startswith(".")]
 
-        # Files of labels may match the pattern of the scans, too.
+        # Files of labels may also match the pattern of the scans.
         place = self.description.labels
         label_paths = set()
         if place is not None and place.file is not None:

@@ -42,7 +42,7 @@ def split_records(
 
     Args:
         train, val: sequences; None for those of `Dataset.sequences`.
-        with_val: train on the sequences of `val`, too, and validate with none.
+        with_val: also train on the sequences of `val`, and validate with none.
 
     Raises:
         InputError: if no sequence is left for one of the two, a sequence does not exist or is one
@@ -86,7 +86,7 @@ def named_sequences(
 
 
 def _sequences_with_val(dataset: Dataset, split: str) -> tuple[str, ...]:
-    """Return the sequences of a split for a training on all scans, one of which may be empty."""
+    """Return the sequences of a split for a training on all scans; one may be empty."""
     try:
         return dataset.sequences(split)
     except InputError:

@@ -1,1 +1,1 @@
-"""Labels of scans in files: those of the benchmarks, of other tools and of this package."""
+"""Label files of the benchmarks, of other tools and of this package."""
