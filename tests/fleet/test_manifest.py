@@ -162,9 +162,25 @@ def test_an_output_folder_among_the_inputs_is_refused_also_through_links(tmp_pat
         ("scans/loop/old.ply", "out"),
     ):
         call = partial(scans_of, [f"{tmp_path}/{inputs}"], f"{tmp_path}/{out}")
-        fails(call, "change --out")
-    fails(partial(scans_of, [path], f"{tmp_path}/out"), "change --out")
+        fails(call, "change ")
+    fails(partial(scans_of, [path], f"{tmp_path}/out"), "change the output folder")
     assert len(scans_of([f"{tmp_path}/scans"], f"{tmp_path}/scans-out")) == 2
+
+
+def test_a_manifest_or_a_link_in_the_output_folder_is_refused(tmp_path: Path) -> None:
+    """A resumed run replaces the tables of results, and labels replace the link."""
+    touch(tmp_path, "scans/a.ply")
+    (tmp_path / "out/results").mkdir(parents=True)
+    (tmp_path / "out/a.ply").symlink_to(tmp_path / "scans/a.ply")
+    columns = {"path": [f"{tmp_path}/scans/a.ply"]}
+    path = write_manifest(tmp_path / "out/results/part-000000.parquet", columns)
+    for text in (path, f"{tmp_path}/out/a.ply"):
+        fails(partial(scans_of, [text], f"{tmp_path}/out"), text, "change the output folder")
+        assert len(scans_of([text])) == 1
+
+
+def test_a_home_of_nobody_is_a_path_where_nothing_is() -> None:
+    fails(partial(scans_of, ["~nobody-has-this-name/scans"]), "found nothing")
 
 
 def test_an_output_prefix_among_the_inputs_is_refused(bucket: Bucket) -> None:
@@ -173,7 +189,7 @@ def test_an_output_prefix_among_the_inputs_is_refused(bucket: Bucket) -> None:
         ("s3://fleet/scans", "s3://anybody:anything@fleet/scans/out"),
         ("s3://fleet/scans/drive0/000000.bin", "s3://fleet/scans/drive0"),
     ):
-        fails(partial(scans_of, [inputs], out), "change --out")
+        fails(partial(scans_of, [inputs], out), "change ")
     assert scans_of(["s3://fleet/scans"], "s3://fleet/scans-out")
 
 

@@ -91,7 +91,8 @@ def list_scans(inputs: Iterable[str], out: Place) -> Iterator[pa.Table]:
         place = Place.of(text)
         is_empty = True
         for table in _list_input(place, out):
-            _check_outside(table["path"].to_pylist(), out)
+            for path in table["path"].to_pylist():
+                check_outside(Place.of(path), out)
             is_empty = False
             yield table
         if is_empty:
@@ -109,6 +110,7 @@ def _list_input(place: Place, out: Place) -> Iterator[pa.Table]:
             "check the URL"
         )
     if kind == FileType.File and place.path.lower().endswith(MANIFESTS):
+        check_outside(place, out)
         yield from _read_manifest(place)
     elif kind == FileType.File:
         folder, _, file = place.address.rpartition("/")
@@ -129,15 +131,13 @@ def _list_input(place: Place, out: Place) -> Iterator[pa.Table]:
             yield from _scans_in(folder_place.address, prefix, files)
 
 
-def _check_outside(urls: Sequence[str], out: Place) -> None:
-    """Raise InputError if a scan lies in the output folder, where labels could replace it."""
-    for url in urls:
-        place = Place.of(url)
-        if place.is_in(out):
-            raise InputError(
-                f"{place.url}: expected scans outside the output folder, found one in {out.url}; "
-                "change --out"
-            )
+def check_outside(place: Place, out: Place) -> None:
+    """Raise InputError if an input lies in the output folder, where outputs could replace it."""
+    if place.is_in(out):
+        raise InputError(
+            f"{place.url}: expected an input outside the output folder, found one in {out.url}; "
+            "change the output folder"
+        )
 
 
 def _scans_in(folder: str, prefix: str, files: Sequence[str]) -> Iterator[pa.Table]:

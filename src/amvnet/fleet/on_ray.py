@@ -276,6 +276,8 @@ class FleetRun:
         context = ray.data.DataContext.get_current()
         context.enable_progress_bars = False
         context.max_errored_blocks = most_lost
+        # A scan that waits for a worker is lost with it; those that are tried alone never wait.
+        queued = QUEUED if max(map(len, blocks)) > 1 else 1
         workers = self.cluster.workers
         dataset = ray.data.from_arrow(list(blocks)).map_batches(
             Worker,
@@ -285,7 +287,7 @@ class FleetRun:
             compute=ray.data.ActorPoolStrategy(
                 min_size=1,
                 max_size=None if workers is None else min(workers, len(blocks)),
-                max_tasks_in_flight_per_actor=QUEUED,
+                max_tasks_in_flight_per_actor=queued,
             ),
             max_task_retries=RETRIES,
             **resources,

@@ -43,7 +43,7 @@ class Place:
         """
         scheme, is_url, rest = url.partition("://")
         if not is_url:
-            path = str(Path(url).expanduser().absolute())
+            path = str(Path(os.path.expanduser(url)).absolute())
             return cls(path, fs.LocalFileSystem(), path)
 
         bucket, slash, path = rest.rstrip("/").partition("/")
@@ -69,13 +69,16 @@ class Place:
         return Path(self.path) if isinstance(self.filesystem, fs.LocalFileSystem) else None
 
     def is_in(self, folder: Place) -> bool:
-        """Return whether the place is a folder or lies in it, after links are followed."""
+        """Return whether the place is a folder or lies in it, by its path or after links."""
         if self.filesystem.type_name != folder.filesystem.type_name:
             return False
-        paths = [place.path for place in (self, folder)]
+        paths = {(self.path, folder.path)}
         if isinstance(self.filesystem, fs.LocalFileSystem):
-            paths = [os.path.realpath(path) for path in paths]
-        return f"{paths[0]}/".startswith(f"{paths[1].rstrip('/')}/")
+            paths = {
+                (spell(self.path), spell(folder.path))
+                for spell in (os.path.abspath, os.path.realpath)
+            }
+        return any(f"{path}/".startswith(f"{parent.rstrip('/')}/") for path, parent in paths)
 
     def kind(self) -> fs.FileType:
         """Return whether it is a file, a folder or nothing.
