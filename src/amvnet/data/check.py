@@ -234,12 +234,14 @@ def _find_contents(
     known = processes.gather(memory.recall(list(records.values())))[0]
     found: dict[str, Contents | str] = {**known}
     unread = [record for name, record in records.items() if name not in known]
+    # Before the scans are read: of a file that changes meanwhile, the old content is not kept.
+    states = {name: _state_of(record) for name, record in records.items()}
     for part in processes.gather(_read_all(dataset, processes.share(unread), progress)):
         found |= part
 
     if unread and processes.first:
         whole = {name: item for name, item in found.items() if isinstance(item, Contents)}
-        memory.keep(records, whole)
+        memory.keep(states, whole)
     return found
 
 
@@ -323,10 +325,14 @@ class Memory:
                     known[record.name] = Contents(int(valid), counts)
         return known
 
-    def keep(self, records: Mapping[str, ScanRecord], contents: Mapping[str, Contents]) -> None:
-        """Remember the contents of scans, and of those that were recalled."""
+    def keep(self, states: Mapping[str, list[list[Any]]], contents: Mapping[str, Contents]) -> None:
+        """Remember the contents of scans, and of those that were recalled.
+
+        Args:
+            states: what `_state_of` returned before the scans were read, by name.
+        """
         for name, found in contents.items():
-            self._entries[name] = (_state_of(records[name]), found.valid, found.ids)
+            self._entries[name] = (states[name], found.valid, found.ids)
         with suppress(OSError, InputError), atomic_write(self.path) as part:
             part.write_text(json.dumps(self._entries), encoding="utf-8")
 

@@ -117,7 +117,7 @@ def _source_of(plan: Plan) -> dict[str, list[str]]:
 def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:
     """Return the counts in a file, or None if it is missing, broken or of other scans."""
     with (
-        suppress(OSError, ValueError, KeyError, BadZipFile),
+        suppress(OSError, ValueError, KeyError, EOFError, BadZipFile),
         np.load(path, allow_pickle=False) as file,
     ):
         if all(file[name].tolist() == values for name, values in source.items()):
