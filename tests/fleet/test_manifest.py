@@ -60,7 +60,7 @@ def test_only_scans_are_listed_and_those_of_other_formats_are_another_drive(tmp_
     touch(tmp_path, "a/1.bin", "a/1.label", "a/2.pcd", "a/3.npz", "a/3.label", "a/4.npz")
     touch(tmp_path, "a/5.bin.gz", "a/6.txt", "a/6.txt.gz", "a/.7.bin", "a/1.uncertain.npy")
     touch(tmp_path, ".hidden/8.bin", "results/part-000000.parquet")
-    expected = {"a/1": "*.bin", "a/2": "*.pcd", "a/4": "*.npz"}
+    expected = {"a/1": "*.bin", "a/2": "*.pcd", "a/4": "*.npz", "a/5.bin": "*.gz"}
     drives = {name: Path(drive).name for name, drive, _ in scans_of([str(tmp_path)])}
     assert drives == expected
 
