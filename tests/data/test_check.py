@@ -205,3 +205,16 @@ def test_a_cache_that_cannot_be_written_costs_only_time(
     assert all(isinstance(found, Contents) for found in report.contents.values())
     assert len(report.contents) == 2
     assert (report.lookup[[3, 55]] == [1, UNKNOWN]).all()
+
+
+def test_a_file_that_changes_during_the_check_is_read_again(data: Path) -> None:
+    dataset = open_dataset(str(data))
+    records = dataset.records(["a"])
+
+    def change_first(done: int, total: int) -> None:
+        if done == total:
+            write_labels(data.parent / "a/0.label", np.full(60, 7))
+
+    check_scans(dataset, {"train": records}, change_first)
+    counts = check_scans(dataset, {"train": records}).contents[records[0].name].ids
+    assert counts == {7: 60}

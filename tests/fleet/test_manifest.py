@@ -15,9 +15,10 @@ import pytest
 from pyarrow.fs import FileType, LocalFileSystem
 
 from amvnet.data.formats import find
+from amvnet.data.formats.find import scan_stem
 from amvnet.errors import InputError
 from amvnet.fleet import manifest
-from amvnet.fleet.manifest import NameSet, list_scans
+from amvnet.fleet.manifest import NameSet, list_scans, split_name
 from amvnet.fleet.storage import Place
 
 from fixtures.s3_server import Bucket
@@ -60,9 +61,14 @@ def test_only_scans_are_listed_and_those_of_other_formats_are_another_drive(tmp_
     touch(tmp_path, "a/1.bin", "a/1.label", "a/2.pcd", "a/3.npz", "a/3.label", "a/4.npz")
     touch(tmp_path, "a/5.bin.gz", "a/6.txt", "a/6.txt.gz", "a/.7.bin", "a/1.uncertain.npy")
     touch(tmp_path, ".hidden/8.bin", "results/part-000000.parquet")
-    expected = {"a/1": "*.bin", "a/2": "*.pcd", "a/4": "*.npz", "a/5.bin": "*.gz"}
+    expected = {"a/1": "*.bin", "a/2": "*.pcd", "a/4": "*.npz", "a/5": "*.bin.gz"}
     drives = {name: Path(drive).name for name, drive, _ in scans_of([str(tmp_path)])}
     assert drives == expected
+
+
+def test_scans_have_the_names_that_predict_gives_them() -> None:
+    for name in ("1.bin", "2.pcd.bin", "3.bin.gz", "4.pcd.bin.gz", "5.PLY", "6.ply.GZ", "7.a.npy"):
+        assert split_name(name)[0] == scan_stem(Path(name))
 
 
 def test_what_cannot_be_listed_is_refused_in_one_line(tmp_path: Path, bucket: Bucket) -> None:

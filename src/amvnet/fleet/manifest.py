@@ -16,7 +16,7 @@ import pyarrow.parquet
 from pyarrow.fs import FileType
 
 from amvnet.data.datasets.open import is_dataset
-from amvnet.data.formats.detect import BAGS, named_ending
+from amvnet.data.formats.detect import BAGS, GZIP, named_ending
 from amvnet.data.formats.find import is_scan_name
 from amvnet.errors import InputError, reason_of, without_secrets
 from amvnet.fleet.storage import Place
@@ -159,9 +159,16 @@ def _scans_in(folder: str, prefix: str, files: Sequence[str]) -> Iterator[pa.Tab
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Return a file's name without its ending, and the ending."""
+    """Return a file's name without its ending, as `predict` names labels, and the ending.
+
+    The ending of a packed file includes the ending of the file in it, such as `.bin.gz`.
+    """
     ending = named_ending(Path(name)) or ""
-    return name[: len(name) - len(ending)], ending
+    stem = name[: len(name) - len(ending)]
+    if ending == GZIP:
+        stem, packed = split_name(stem)
+        ending = packed + ending
+    return stem, ending
 
 
 def _as_path(name: str) -> str:
