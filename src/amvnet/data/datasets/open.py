@@ -6,8 +6,9 @@ import os
 from pathlib import Path
 
 from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.description import ENDINGS, is_description
 from amvnet.data.datasets.nuscenes import NuScenes
-from amvnet.data.datasets.own import ENDINGS, OwnScans, is_description, open_own
+from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.simulated import SENSORS, SimulatedStreets
 from amvnet.data.taxonomy import Taxonomy, describe_difference
