@@ -17,7 +17,6 @@ import yaml
 
 from amvnet.errors import InputError, shown
 
-CACHE = "AMVNET_CACHE"  # environment variable: the folder for files that can be made again
 LARGEST_YAML = 50_000  # size of a YAML file, bytes; PyYAML takes a second for it
 DEEPEST_YAML = 50  # levels of nested values in a YAML file
 LONGEST_INTEGER = 40  # digits of a whole number in a YAML file
@@ -130,7 +129,7 @@ def inside(folder: Path | str, name: Path | str) -> Path:
     """
     folder = Path(folder)
     name = Path(name)
-    fault = _fault_of(name)
+    fault = fault_of_name(name)
     if fault is not None:
         raise InputError(
             f"{folder}: expected names of output files inside it, found {fault} in "
@@ -160,7 +159,7 @@ def _refuse_link(path: Path) -> None:
         )
 
 
-def _fault_of(name: Path) -> str | None:
+def fault_of_name(name: Path) -> str | None:
     """Return what is wrong with the name of an output file, relative to its folder, or None."""
     if name.anchor or ".." in name.parts or not name.name:
         return "a path that leads elsewhere"
@@ -195,17 +194,6 @@ def make_folder(path: Path) -> None:
         raise InputError(
             f"{path}: expected a folder to write to, found {problem}; give another"
         ) from None
-
-
-def user_cache() -> Path:
-    """Return the folder for files that can be made again.
-
-    It is $AMVNET_CACHE, or else amvnet in the user's cache.
-    """
-    if os.environ.get(CACHE):
-        return Path(os.environ[CACHE])
-    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(caches) / "amvnet"
 
 
 def read_yaml(path: Path, content: str) -> Any:

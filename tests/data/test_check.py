@@ -16,7 +16,7 @@ from amvnet.data.taxonomy import UNKNOWN
 
 from fixtures.datasets import MAKERS
 from fixtures.scan_writers import some_points
-from fixtures.worlds import make_streets, run_cli, write_recipe
+from fixtures.worlds import make_streets, run_cli, succeed, write_recipe
 
 SITES = ("a", "b", "c")  # c validates
 RAW = np.random.default_rng(1).choice([3, 7, 40], 60)
@@ -218,3 +218,23 @@ def test_a_file_that_changes_during_the_check_is_read_again(data: Path) -> None:
     check_scans(dataset, {"train": records}, change_first)
     counts = check_scans(dataset, {"train": records}).contents[records[0].name].ids
     assert counts == {7: 60}
+
+
+def test_what_another_user_can_write_is_not_believed(data: Path, cache: Path) -> None:
+    succeed(f"check {data}")
+    (memory,) = (cache / "checked").iterdir()
+    assert memory.stat().st_mode & 0o077 == 0
+    memory.write_text(memory.read_text().replace('"3"', '"7"'))  # other labels
+    forged = counts_of(data)
+    assert forged[0] == 0
+
+    memory.chmod(0o666)
+    assert counts_of(data)[0] == 3 * 2 * np.count_nonzero(RAW == 3)
+
+
+def counts_of(data: Path) -> np.ndarray:
+    """Return the (K,) points of each class in all splits, as `check` finds them."""
+    dataset = open_dataset(str(data))
+    records = dataset.records(dataset.sequences("all"))
+    report = check_scans(dataset, {"train": records})
+    return report.splits["train"].points[1:]

@@ -18,6 +18,7 @@ from amvnet.data.formats.detect import BAGS, GZIP, named_ending
 from amvnet.data.formats.find import list_scans, read_cloud, scan_stem
 from amvnet.data.formats.rows import parse_layout
 from amvnet.errors import InputError
+from amvnet.files import fault_of_name
 from amvnet.weights.file import save
 
 from fixtures.scan_writers import WRITERS, some_points, write_sweep
@@ -177,7 +178,7 @@ def test_a_broken_packed_file_is_one_line(tmp_path: Path, contents: dict[str, by
 
 
 def test_nothing_leaves_an_archive(tmp_path: Path, contents: dict[str, bytes]) -> None:
-    """Names that lead elsewhere, links and archives in archives are no scans."""
+    """Names that lead elsewhere, and links, are broken scans; archives in archives are none."""
     link = zipfile.ZipInfo("link.bin")
     link.create_system = 3
     link.external_attr = 0o120777 << 16
@@ -188,11 +189,18 @@ def test_nothing_leaves_an_archive(tmp_path: Path, contents: dict[str, bytes]) -
         archive.writestr("inner.zip", zip_of(tmp_path / "i.zip", contents).read_bytes())
         archive.writestr("inner.bin.gz", gzip.compress(contents["kitti.bin"]))
         archive.writestr("/absolute.bin", contents["kitti.bin"])
+        archive.writestr("new\nline.bin", contents["kitti.bin"])
+        archive.writestr(f"{'long' * 70}.bin", contents["kitti.bin"])
     before = set(tmp_path.rglob("*"))
 
     scans = {scan.name: scan for scan in list_scans(path)}
-    assert set(scans) == {"a/good", "a/link"}
+    refused = [name for name in scans if name.startswith("a/member-")]
+    assert len(refused) == 4
+    assert set(scans) == {"a/good", "a/link", *refused}
     fails(scans["a/link"].read, f"{path} (link.bin)")
+    for name in refused:
+        fails(scans[name].read, str(path), "expected the name of a scan", "rename it")
+        assert fault_of_name(Path(name)) is None
     assert len(scans["a/good"].read().xyz) == len(some_points())
     assert set(tmp_path.rglob("*")) == before
 
@@ -203,6 +211,20 @@ def test_nothing_leaves_an_archive(tmp_path: Path, contents: dict[str, bytes]) -
     whole = zip_of(tmp_path / "whole.zip", {"good.bin": contents["kitti.bin"]})
     (tmp_path / "cut.zip").write_bytes(whole.read_bytes()[:-30])
     fails(lambda: list(list_scans(tmp_path / "cut.zip")), "cut.zip")
+
+
+def test_an_archive_with_a_bad_name_is_segmented_but_for_this_scan(
+    tmp_path: Path, contents: dict[str, bytes]
+) -> None:
+    points, _ = street(3)
+    members = {"good.bin": points.tobytes(), "../up.bin": points.tobytes()}
+    path = zip_of(tmp_path / "a.zip", members)
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    code, error = run_cli("predict", path, "--weights", weights, "--out", tmp_path / "out")
+    assert code == 3
+    assert "up.bin" in error
+    assert [file.name for file in (tmp_path / "out").rglob("*.label")] == ["good.label"]
+    assert not (tmp_path / "up.label").exists()
 
 
 def test_an_archive_of_a_user_is_segmented(tmp_path: Path, contents: dict[str, bytes]) -> None:

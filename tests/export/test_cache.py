@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 
 import amvnet
+from amvnet import cache as user_files
+from amvnet.cache import user_cache
 from amvnet.engines.onnx import RANGE_NET, UNET
 from amvnet.export import cache
-from amvnet.export.cache import cache_folder, cached_networks
+from amvnet.export.cache import cached_networks
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
 from amvnet.weights.file import Weights
 
@@ -91,7 +93,7 @@ def test_networks_are_exported_once_for_each_weights_and_precision(exports: Expo
     cached(int8="simulated")
     assert exports.count == 3
     assert len(folders) == 2
-    assert {path.name for path in cache_folder().glob("onnx/*")} > {each.name for each in folders}
+    assert {path.name for path in user_cache().glob("onnx/*")} > {each.name for each in folders}
 
 
 def truncate(path: Path) -> None:
@@ -137,7 +139,7 @@ def test_what_is_changed_in_the_cache_is_exported_again(
 
     assert cached() == (before, "")
     assert exports.count == 2
-    assert files(cache_folder()) == {
+    assert files(user_cache()) == {
         f"onnx/{folder.name}/{each}"
         for each in (*(f"{n}.onnx" for n in GRAPHS["amvnet"]), DESCRIPTION)
     }
@@ -171,14 +173,14 @@ def writable(path: Path, mode: int) -> Callable[[], None]:
 def test_a_cache_that_another_user_can_write_is_not_used_and_that_is_said(
     place: str, mode: int, exports: Exports, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cache, "_is_group_of_one", lambda gid: False)
+    monkeypatch.setattr(user_files, "_is_group_of_one", lambda gid: False)
     folder = filled()
     changed = (folder / place).resolve()
     before = stat.S_IMODE(changed.stat().st_mode)
     changed.chmod(before | mode)
     exports.content = b"another graph"
     try:
-        stored = {name: (cache_folder() / name).read_bytes() for name in files(cache_folder())}
+        stored = {name: (user_cache() / name).read_bytes() for name in files(user_cache())}
         for count in (2, 3):
             networks, said = cached()
             assert str(changed) in said
@@ -188,7 +190,7 @@ def test_a_cache_that_another_user_can_write_is_not_used_and_that_is_said(
             assert exports.count == count
             assert cached_folder_is_none()
             exports.count -= 1
-        assert {n: (cache_folder() / n).read_bytes() for n in stored} == stored
+        assert {n: (user_cache() / n).read_bytes() for n in stored} == stored
     finally:
         changed.chmod(before)
     assert cached()[1] == ""
@@ -231,7 +233,7 @@ def test_a_cache_of_another_user_is_not_used(
 ) -> None:
     filled()
     monkeypatch.setattr(os, "getuid", lambda: 12_345_678)
-    monkeypatch.setattr(cache, "_is_own", lambda status: False)
+    monkeypatch.setattr(user_files, "_is_own", lambda status: False)
     assert "no other user" in cached()[1]
 
 
@@ -241,7 +243,7 @@ def test_new_folders_and_files_of_the_cache_are_private(exports: Exports) -> Non
         folder = filled()
     finally:
         os.umask(before)
-    for path in (cache_folder(), folder.parent, folder):
+    for path in (user_cache(), folder.parent, folder):
         assert stat.S_IMODE(path.stat().st_mode) == 0o700
     for path in folder.iterdir():
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -278,7 +280,7 @@ def test_concurrent_exports_into_one_cache_all_succeed_and_leave_one_whole(
     kept, said = cached()
     assert not said
     assert kept in results
-    assert len(list((cache_folder() / "onnx").iterdir())) == 1
+    assert len(list((user_cache() / "onnx").iterdir())) == 1
 
 
 def test_an_export_that_fails_leaves_nothing(
@@ -291,7 +293,7 @@ def test_an_export_that_fails_leaves_nothing(
     monkeypatch.setattr(cache, "export", fail)
     with pytest.raises(KeyboardInterrupt):
         cached()
-    assert list((cache_folder() / "onnx").iterdir()) == []
+    assert list((user_cache() / "onnx").iterdir()) == []
 
 
 def test_a_cache_that_cannot_be_made_is_one_line(
@@ -304,15 +306,15 @@ def test_a_cache_that_cannot_be_made_is_one_line(
 
 def test_the_cache_lies_where_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "cache"))
-    assert cache_folder() == tmp_path / "cache"
+    assert user_cache() == tmp_path / "cache"
 
     monkeypatch.delenv("AMVNET_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
-    assert cache_folder() == tmp_path / "caches" / "amvnet"
+    assert user_cache() == tmp_path / "caches" / "amvnet"
 
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / ".cache" / "amvnet"
+    assert user_cache() == tmp_path / ".cache" / "amvnet"
 
 
 def test_weights_of_one_network_have_one_graph(

@@ -415,6 +415,21 @@ def test_rows_by_ring_need_a_ring() -> None:
     assert segmenter(Scan(POINTS, ring=ring)).labels.max() <= 16
 
 
+def test_the_columns_of_a_file_are_as_the_user_says(tmp_path: Path) -> None:
+    points = POINTS[:, [1, 0, 2, 3]]
+    path = tmp_path / "scan.bin"
+    points.astype(np.float32).tofile(path)
+    POINTS.astype(np.float32).tofile(tmp_path / "usual.bin")
+    segmenter = amvnet.load(WEIGHTS)
+    expected = segmenter(tmp_path / "usual.bin").labels
+    assert np.array_equal(segmenter(path, columns="y,x,z,intensity").labels, expected)
+    assert not np.array_equal(segmenter(path).labels, expected)
+
+
+def test_a_scan_has_its_own_columns() -> None:
+    fails(lambda: amvnet.load(WEIGHTS)(Scan(POINTS), columns="y,x,z,intensity"), "columns")
+
+
 def test_the_rows_of_a_scan_take_precedence_over_its_elevations_and_rings() -> None:
     """By elevation, the lasers of another sensor would be in other rows."""
     for weights in (WEIGHTS, fresh_weights(NUSCENES)):

@@ -441,17 +441,6 @@ def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
     assert "last.ckpt" in error
 
 
-def test_broken_class_counts_are_counted_again(world: Path, run: Path, tmp_path: Path) -> None:
-    contents = (run / "class_counts.npz").read_bytes()
-    (tmp_path / "class_counts.npz").write_bytes(contents[:100])
-    shutil.copy(run / "run.yaml", tmp_path)
-    train(world, tmp_path, "--stage", "rv", "--training.rv.epochs", 1)
-    with np.load(run / "class_counts.npz") as file:
-        expected = file["counts"]
-    with np.load(tmp_path / "class_counts.npz") as file:
-        assert np.array_equal(file["counts"], expected)
-
-
 def test_a_broken_label_file_is_one_line_of_error_from_a_reading_process_too(
     world: Path, tmp_path: Path
 ) -> None:
@@ -482,6 +471,19 @@ def test_an_existing_run_is_not_overwritten_without_resume(world: Path, run: Pat
     before = [path.read_bytes() for path in paths]
     assert "--resume" in fail(*train_arguments(world, run))
     assert [path.read_bytes() for path in paths] == before
+
+
+def test_a_finished_stage_without_its_checkpoint_is_not_trained_again(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(run, out)
+    for stage in PART_OF:
+        (out / stage / "last.ckpt").unlink()
+    before = {path: (out / path).read_bytes() for path in files(out)}
+    assert "--resume" in fail(*train_arguments(world, out))
+    assert {path: (out / path).read_bytes() for path in files(out)} == before
+    assert not differing(train(world, out, "--resume"), load(run))
 
 
 def test_the_head_stage_leaves_the_networks_bitwise_unchanged(

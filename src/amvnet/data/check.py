@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from amvnet.cache import PRIVATE_FILE, make_private, shared_with_others, user_cache
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import atomic_write, user_cache
+from amvnet.files import atomic_write
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 
@@ -299,7 +300,8 @@ def _contents_of(dataset: Dataset, record: ScanRecord) -> Contents:
 class Memory:
     """The contents of a dataset's scans in the user's cache, as long as their files do not change.
 
-    What cannot be read or written there is forgotten: it only costs time.
+    What cannot be read or written there, or what another user can write, is forgotten: it only
+    costs time.
     """
 
     def __init__(self, dataset: Dataset) -> None:
@@ -312,7 +314,8 @@ class Memory:
         """Return the remembered contents of scans by name."""
         entries: Any = None
         with suppress(OSError, ValueError, RecursionError):
-            if self.path.stat().st_size <= LARGEST_MEMORY:
+            is_private = shared_with_others(self.path.parent) is None
+            if is_private and self.path.stat().st_size <= LARGEST_MEMORY:
                 entries = json.loads(self.path.read_text(encoding="utf-8"))
         self._entries = entries if isinstance(entries, dict) else {}
 
@@ -333,8 +336,11 @@ class Memory:
         """
         for name, found in contents.items():
             self._entries[name] = (states[name], found.valid, found.ids)
-        with suppress(OSError, InputError), atomic_write(self.path) as part:
-            part.write_text(json.dumps(self._entries), encoding="utf-8")
+        with suppress(OSError, InputError):
+            make_private(self.path.parent)
+            with atomic_write(self.path) as part:
+                part.write_text(json.dumps(self._entries), encoding="utf-8")
+            self.path.chmod(PRIVATE_FILE)
 
 
 def _state_of(record: ScanRecord) -> list[list[Any]]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
-import stat
 import uuid
 from contextlib import suppress
 from importlib.metadata import version
@@ -14,28 +12,24 @@ from tempfile import TemporaryDirectory
 
 import torch
 
+from amvnet.cache import (
+    CACHE,
+    PRIVATE_FILE,
+    PRIVATE_FOLDER,
+    make_private,
+    shared_with_others,
+    user_cache,
+)
 from amvnet.engines.onnx import RANGE_NET, UNET, ExportedNetworks
 from amvnet.errors import InputError
 from amvnet.export.onnx import OPSET, check_libraries, export
-from amvnet.files import make_folder, unfinished
+from amvnet.files import unfinished
 from amvnet.models.methods import widest_method
 from amvnet.onnx_runner import read_description, read_graph
 from amvnet.progress import Say, say_nothing
 from amvnet.weights.file import Weights
 
-CACHE = "AMVNET_CACHE"  # the environment variable with the cache's folder
-PRIVATE_FOLDER = 0o700
-PRIVATE_FILE = 0o600
 ATTEMPTS = 10  # to give a folder its name while other processes do the same
-
-
-def cache_folder() -> Path:
-    """Return where exported networks are kept: $AMVNET_CACHE, or amvnet in the user's cache."""
-    if os.environ.get(CACHE):
-        return Path(os.environ[CACHE])
-
-    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(caches) / "amvnet"
 
 
 def cached_networks(
@@ -56,8 +50,8 @@ def cached_networks(
     """
     check_libraries()
     exported = "exported" if int8 is None else "exported and calibrated in int8"
-    folder = cache_folder() / "onnx" / _key(weights, int8)
-    shared = _shared_with_others(folder)
+    folder = user_cache() / "onnx" / _key(weights, int8)
+    shared = shared_with_others(folder)
     if shared is not None:
         say(
             f"{shared}: expected a cache that no other user can write, found one that others can; "
@@ -96,7 +90,7 @@ def _read(folder: Path, weights: Weights) -> dict[str, bytes]:
 
 def _export(weights: Weights, int8: str | None, folder: Path) -> dict[str, bytes]:
     """Export into a folder of the cache, which appears whole; return what was exported."""
-    _make_private(folder.parent)
+    make_private(folder.parent)
     part = folder.with_name(f".{uuid.uuid4().hex}.part")
     part.mkdir(PRIVATE_FOLDER)
     unfinished.add(part)
@@ -133,67 +127,3 @@ def _publish(part: Path, folder: Path, weights: Weights) -> None:
             shutil.rmtree(broken, ignore_errors=True)
         else:
             broken.unlink(missing_ok=True)
-
-
-def _make_private(folder: Path) -> None:
-    """Make a folder of the cache, and those above it, for this user alone."""
-    for path in reversed([folder, *folder.parents]):
-        try:
-            path.mkdir(PRIVATE_FOLDER, exist_ok=True)
-        except OSError:
-            make_folder(path)  # explains what is wrong
-
-
-# ---- who can write
-
-
-def _shared_with_others(folder: Path) -> Path | None:
-    """Return what another user can write or replace of a folder of the cache; None if nothing.
-
-    The system's administrator is not another user.
-    """
-    if not hasattr(os, "getuid"):  # the modes of files on Windows say nothing
-        return None
-
-    root = cache_folder()
-    files = list(folder.iterdir()) if folder.is_dir() else []
-    for path in (*files, folder, folder.parent, root, root.resolve()):
-        if path.exists() and not (_is_own(path.stat()) and _is_own(path.lstat())):
-            return path
-    # Whoever can rename a folder can put another one in its place.
-    for path in (*root.absolute().parents, *root.resolve().parents):
-        if path.exists() and _can_others_write(path.stat()) and not _is_sticky(path.stat()):
-            return path
-    return None
-
-
-def _is_own(status: os.stat_result) -> bool:
-    """Return whether a file belongs to this user or the administrator, and only they can write."""
-    if status.st_uid not in (0, os.getuid()):
-        return False
-    return stat.S_ISLNK(status.st_mode) or not _can_others_write(status)
-
-
-def _can_others_write(status: os.stat_result) -> bool:
-    """Return whether the mode lets others than the owner write."""
-    by_group = status.st_mode & stat.S_IWGRP and not _is_group_of_one(status.st_gid)
-    return bool(status.st_mode & stat.S_IWOTH or by_group)
-
-
-def _is_sticky(status: os.stat_result) -> bool:
-    """Return whether only owners can rename what is in a folder, as in /tmp."""
-    return bool(status.st_mode & stat.S_ISVTX)
-
-
-def _is_group_of_one(gid: int) -> bool:
-    """Return whether a group is the private one of this user, as some systems make for each."""
-    import grp
-    import pwd
-
-    try:
-        user = pwd.getpwuid(os.getuid())
-        group = grp.getgrgid(gid)
-    except KeyError:
-        return False
-    names = {group.gr_name, *group.gr_mem}
-    return gid == user.pw_gid and names == {user.pw_name}

@@ -26,7 +26,7 @@ from amvnet.data.formats.registry import read_file
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, without_secrets
 from amvnet.files import temporary_folder
-from amvnet.fleet.manifest import split_name
+from amvnet.fleet.manifest import check_outside, split_name
 from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, results_schema
 from amvnet.fleet.storage import Place
 from amvnet.inference.listing import FileReader, FileScan
@@ -118,6 +118,9 @@ class LabelScans:
     def _label(self, drive: Sequence[Row]) -> list[Row]:
         """Label scans of one drive."""
         start = time.perf_counter()
+        for row in drive:
+            check_outside(Place.of(row["path"]), self._out)
+
         request = self.request
         reader = _make_reader(request)
         if drive[0]["estimates"]:

@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+from amvnet.data.formats.rows import UNKNOWN, RowLayout, parse_layout
 from amvnet.data.laser_order import with_lasers
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
@@ -86,18 +87,24 @@ class Segmenter:
                 list; or an array with other columns or with named fields (`array_scan`); or a
                 `Scan`; or the path of a scan file, which is normalised to the weights as `amvnet
                 predict` does.
-            columns: of an array, what its columns hold, such as "x,y,z,intensity,ring"; None means
-                the names of its fields, or what their number and values suggest.
+            columns: of an array or a file of rows, what its columns hold, such as
+                "x,y,z,intensity,ring"; by default the names of its fields, or what their number
+                and values suggest.
 
         Raises:
             InputError: if there is no valid point, more than a few intensities are out of range,
                 the model needs a ring index and there is none, or a file cannot be read or holds
                 several scans.
         """
+        if isinstance(points, Scan) and columns is not None:
+            raise InputError(
+                "columns: expected them for an array or a file, found a Scan, which has its own; "
+                "leave them out"
+            )
         if not isinstance(points, Path | str):
             return self._segment([checked_scan(points, columns, self.intensity)])[0]
 
-        scans, assumed = self._open(points)
+        scans, assumed = self._open(points, layout=parse_layout(columns, None))
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
@@ -152,12 +159,12 @@ class Segmenter:
         return (self._segment_input(scan, assumed) for scan in scans)
 
     def _open(
-        self, path: Path | str, topic: str | None = None
+        self, path: Path | str, topic: str | None = None, layout: RowLayout = UNKNOWN
     ) -> tuple[Sequence[InputScan], list[str]]:
         """Return the scans of a path, and a list that receives what is assumed of them."""
         assumed: list[str] = []
         normaliser = normaliser_for(self.weights, say=assumed.append)
-        options = ScanOptions(topic=topic)
+        options = ScanOptions(topic=topic, layout=layout)
         scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
         return scans, assumed
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
-from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -49,22 +46,12 @@ def check_data(plan: Plan) -> np.ndarray:
     return totals[1:]
 
 
-def class_counts(plan: Plan) -> np.ndarray:
-    """Return the (K,) counts of `check_data`, which are kept in the folder of the run."""
-    # The first process reads for all: others might already see the file that it writes below.
-    kept = plan.processes.gather(_read_counts(plan.out / COUNTS, _source_of(plan)))[0]
-    if kept is not None:
-        return kept
-    counts = check_data(plan)
-    keep_counts(plan, counts)
-    return counts
-
-
 def keep_counts(plan: Plan, counts: np.ndarray) -> None:
-    """Write the (K,) counts of `check_data` into the folder of the run."""
+    """Write the (K,) counts of `check_data` into the folder of the run, for `weights.calibrate`."""
     if plan.processes.first:
         with atomic_write(plan.out / COUNTS) as part:
-            np.savez(part, counts=counts, **_source_of(plan))  # type: ignore[arg-type]
+            names = [record.name for record in plan.scans.train]
+            np.savez(part, counts=counts, scans=names, classes=plan.scans.dataset.taxonomy.classes)
 
 
 def _datasets_of(
@@ -104,22 +91,3 @@ def _refuse(report: Report) -> None:
             f"{counted(total, 'scan')} that cannot: {next(iter(broken.values()))}{rest}; correct "
             "them or leave them out (amvnet check lists all)"
         )
-
-
-def _source_of(plan: Plan) -> dict[str, list[str]]:
-    """Return what the counts are of."""
-    return {
-        "scans": [record.name for record in plan.scans.train],
-        "classes": list(plan.scans.dataset.taxonomy.classes),
-    }
-
-
-def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:
-    """Return the counts in a file, or None if it is missing, broken or of other scans."""
-    with (
-        suppress(OSError, ValueError, KeyError, EOFError, BadZipFile),
-        np.load(path, allow_pickle=False) as file,
-    ):
-        if all(file[name].tolist() == values for name, values in source.items()):
-            return file["counts"]
-    return None

@@ -18,7 +18,6 @@ from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import counted
 from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
-from amvnet.training.checking import class_counts
 from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
@@ -221,7 +220,10 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     intensity = _intensity(plan, weights)
     loaders = make_loaders(plan, config, intensity)
     # The weights of the classes in the loss (section 4.2 of the paper).
-    of_classes = class_weights(class_counts(plan)) if config.class_weights else None
+    of_classes = None
+    if config.class_weights:
+        assert plan.class_counts is not None
+        of_classes = class_weights(plan.class_counts)
     stage = make_stage(plan, name, model, of_classes)
     try:
         fit(stage, plan, loaders, weights, intensity)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.joined import join
@@ -39,6 +41,8 @@ class Plan:
         scores: two other models' scores of the scans, to train the head on instead of on the
             networks'; None without other models.
         also_read: files besides the scans that the run reads; what names no file is left out.
+        class_counts: (K,) points of each class in the training scans of an epoch; None before the
+            scans are checked.
         stages: the stages of this call in order, for the whole time left; empty if unknown.
 
     Raises:
@@ -55,6 +59,7 @@ class Plan:
     processes: Processes = ALONE
     scores: ScorePair | None = None
     also_read: Sequence[Path | str | None] = ()
+    class_counts: np.ndarray | None = None
     stages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -54,6 +54,7 @@ def train(
     for name in names:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
     counts = check_data(plan)
+    plan = dataclasses.replace(plan, class_counts=counts)
     plan.processes.wait()
     if plan.processes.first:
         write_record(plan, stage, init)

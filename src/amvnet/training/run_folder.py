@@ -158,7 +158,8 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     Raises:
         InputError: if the stage was begun before, and is not to be resumed or had other settings.
     """
-    if not (folder / LAST).is_file():
+    # A finished stage may have lost its checkpoint, which is of no use any more.
+    if not any((folder / name).is_file() for name in (LAST, DONE)):
         return
     if not resume:
         raise InputError(

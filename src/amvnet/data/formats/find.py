@@ -27,7 +27,8 @@ from amvnet.data.formats.detect import (
 from amvnet.data.formats.registry import list_archive, open_bag, read_file, read_from_archive
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_table, read_head
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
+from amvnet.files import fault_of_name
 
 ANY_FOLDERS = "**"  # stands for any folders in a pattern
 POSE_COLUMNS = 12  # numbers in a line of KITTI's files of poses: a 3 x 4 matrix
@@ -152,10 +153,24 @@ def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> li
 
 
 def _scans_of_archive(file: Path, name: str, layout: RowLayout) -> list[NamedScan]:
-    """Return the scans of an archive; the files of each of its folders are a recording."""
+    """Return the scans of an archive; the files of each of its folders are a recording.
+
+    A member whose name no label file may have is a broken scan, named by its number.
+    """
     scans = []
-    for member in list_archive(file):
+    for index, member in enumerate(list_archive(file)):
         place = Path(member)
+        fault = fault_of_name(place)
+        if fault is not None:
+            refuse = partial(
+                _refuse,
+                f"{file} ({shown(member)}): expected the name of a scan, found {fault}; rename it "
+                "in the archive",
+            )
+            title = f"{name}/member-{index:06d}"
+            scans.append(NamedScan(title, source=str(file), path=file, ending="", read=refuse))
+            continue
+
         ending = named_ending(place) or ""
         scans.append(
             NamedScan(

@@ -67,10 +67,12 @@ def read_member(path: Path, name: str, read: Read) -> Cloud:
 def _is_scan(name: str) -> bool:
     """Return whether a file of an archive is a scan by its name."""
     place = Path(name)
-    is_hidden = any(part.startswith(".") or part == "__MACOSX" for part in place.parts)
+    is_hidden = any(
+        part == "__MACOSX" or (part.startswith(".") and part != "..") for part in place.parts
+    )
     ending = named_ending(place)
     is_scan = ending is not None and ending not in (*BAGS, GZIP, ARCHIVE)
-    return is_scan and not is_hidden and not place.anchor
+    return is_scan and not is_hidden
 
 
 def _read_unpacked(packed: IO[bytes] | gzip.GzipFile, name: str, title: str, read: Read) -> Cloud:
