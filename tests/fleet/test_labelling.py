@@ -25,7 +25,8 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.weights.file import load
 
 from fixtures.s3_server import Bucket
-from fixtures.worlds import fails, succeed
+from fixtures.scan_writers import write_ply
+from fixtures.worlds import fails, street, succeed
 
 NOWHERE = Place.of("/an/output/folder/elsewhere")
 
@@ -129,10 +130,25 @@ def test_broken_scans_have_a_row_with_one_line_and_the_others_labels(
 
 
 def test_a_scan_that_is_gone_is_a_broken_one(labelling: LabellingRequest, tmp_path: Path) -> None:
-    worker = LabelScans(labelling, str(tmp_path))
+    worker = LabelScans(labelling, f"{tmp_path}/out")
     for path in (f"{tmp_path}/gone.bin", "s3://fleet/gone.bin"):
         (row,) = worker(pa.table({"path": [path]})).to_pylist()
         assert row["error"].startswith(f"{path}: expected")
+        assert "output folder" not in row["error"]
+
+
+def test_a_scan_in_the_output_folder_is_not_replaced(
+    labelling: LabellingRequest, tmp_path: Path
+) -> None:
+    """In a pipeline of one's own, nobody has listed the scans."""
+    points, _ = street(0)
+    path = tmp_path / "a.ply"
+    write_ply(path, points)
+    before = path.read_bytes()
+    worker = LabelScans(replace(labelling, kind="ply"), str(tmp_path))
+    (row,) = worker(pa.table({"path": [str(path)]})).to_pylist()
+    assert "expected an input outside the output folder" in row["error"]
+    assert path.read_bytes() == before
 
 
 def test_a_fault_of_a_library_is_the_row_of_its_scan_and_the_others_are_labelled(
