@@ -93,7 +93,7 @@ RECIPES = {
 }
 
 # Each line is a command of amvnet, run in OUT.
-COMMANDS = """
+COMMAND_LINES = """
 simulate city64 --sequences 3 --scans 1 --seed 5 --processes 1
 simulate city32 --sequences 3 --scans 2 --seed 6 --processes 1 --sensor hdl32e
 
@@ -158,7 +158,7 @@ export --weights sim-hdl64e --out graphs/64
 export --weights sim-hdl64e --out graphs/64-int8 --int8 city64
 export --weights sim-hdl32e --out graphs/32
 """
-REAL_COMMANDS = f"""
+REAL_COMMAND_LINES = f"""
 predict {REAL}/semantickitti --weights sim-hdl64e --out real-labels/kitti
 predict {REAL}/nuscenes --weights sim-hdl32e --scores --uncertain --out real-labels/nuscenes
 predict {REAL}/formats --weights sim-hdl64e --scores --uncertain --out real-labels/formats64
@@ -166,8 +166,8 @@ predict {REAL}/formats --weights sim-hdl32e --scores --uncertain --out real-labe
 evaluate {REAL}/semantickitti --split all --predictions real-labels/kitti --json figures/kitti.json
 """
 
-# Options and their defaults are read from the help of each verb, and of `train` with each recipe.
-VERBS = (
+# The help of each command, and the help of `train` with each recipe, give options and defaults.
+COMMANDS = (
     *("demo", "simulate", "train", "predict", "evaluate", "submit", "fuse", "rank"),
     *("analyze", "ablate", "export", "view", "bench", "info"),
 )
@@ -180,24 +180,24 @@ Part = np.ndarray | str
 
 
 def main() -> int:
-    """Run a verb; return the exit code."""
+    """Run a command; return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    making = verbs.add_parser("make", help="run everything and digest the results")
+    subparsers = parser.add_subparsers(dest="command", required=True)
+    making = subparsers.add_parser("make", help="run everything and digest the results")
     making.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     making.add_argument("--real", type=Path, metavar="FOLDER", help="real scans")
-    comparing = verbs.add_parser("compare", help="print what differs")
+    comparing = subparsers.add_parser("compare", help="print what differs")
     comparing.add_argument("before", type=Path, metavar="BEFORE")
     comparing.add_argument("after", type=Path, metavar="AFTER")
-    verbs.add_parser("library", help="what `make` runs within OUT to use the public functions")
+    subparsers.add_parser("library", help="what `make` runs within OUT to use the public functions")
     arguments = parser.parse_args()
 
-    if arguments.verb == "make":
+    if arguments.command == "make":
         make(arguments.out, arguments.real)
         return 0
-    if arguments.verb == "compare":
+    if arguments.command == "compare":
         return compare(arguments.before, arguments.after)
     use_library()
     return 0
@@ -220,7 +220,7 @@ def make(out: Path, real: Path | None) -> None:
     run = Runner(out)
     print(f"measuring {run.installed()}")
     save_help(run, out / "help")
-    for words in commands(COMMANDS + (REAL_COMMANDS if real else "")):
+    for words in words_of_lines(COMMAND_LINES + (REAL_COMMAND_LINES if real else "")):
         run("-m", "amvnet", *words)
     run(str(Path(__file__).resolve()), "library")
 
@@ -233,17 +233,17 @@ def make(out: Path, real: Path | None) -> None:
 
 
 def save_help(run: Runner, folder: Path) -> None:
-    """Write what `--help` prints, a file for each verb and for each recipe."""
+    """Write what `--help` prints, a file for each command and for each recipe."""
     folder.mkdir()
-    for verb in VERBS:
-        (folder / f"{verb}.help").write_text(run("-m", "amvnet", verb, "--help"))
+    for command in COMMANDS:
+        (folder / f"{command}.help").write_text(run("-m", "amvnet", command, "--help"))
     for recipe in BUILT_IN_RECIPES:
         text = run("-m", "amvnet", "train", recipe, "--help")
         (folder / f"train-{recipe}.help").write_text(text)
 
 
-def commands(text: str) -> Iterator[list[str]]:
-    """Yield the words of each command, without comments."""
+def words_of_lines(text: str) -> Iterator[list[str]]:
+    """Yield the words of each line, without comments; lines that end in a backslash go on."""
     for line in text.replace("\\\n", " ").splitlines():
         if words := shlex.split(line, comments=True):
             yield words
@@ -432,7 +432,7 @@ def read_table(path: Path) -> dict[str, Part]:
 
 
 def read_help(path: Path) -> dict[str, Part]:
-    """Read the options of a verb, with their types and defaults; without what is said of them."""
+    """Read the options of a command with their types and defaults, without their descriptions."""
     text = re.sub(r"\bamvnet[\w.]*\.", "", path.read_text())  # a class may move to another module
     parts: dict[str, Part] = {}
     for option in re.split(r"\n  (?=-)", text)[1:]:

@@ -1,4 +1,4 @@
-"""Write the help of every verb into the page on the command line, when MkDocs builds the site."""
+"""Write the help of every command into docs/command_line.md when MkDocs builds the site."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from amvnet.cli.main import main
 from amvnet.cli.recipe_options import HELP_ALL
 
 PAGE = "command_line.md"
-PLACE = "<!-- the help of every verb -->"
+PLACE = "<!-- the help of every command -->"
 WIDTH = 100  # columns
 
 
@@ -25,19 +25,19 @@ def help_of(*words: str, option: str = "--help") -> str:
     return printed.getvalue().strip()
 
 
-def verbs() -> list[str]:
-    """Return the verbs in the order in which `amvnet --help` lists them."""
+def commands() -> list[str]:
+    """Return the commands in the order in which `amvnet --help` lists them."""
     return re.findall(r"(?m)^  (\w+)  ", help_of())
 
 
 def reference() -> str:
-    """Return a section with the help of each verb, in Markdown."""
+    """Return a section with the help of each command, in Markdown."""
     sections = []
-    for verb in verbs():
-        text = help_of(verb)
+    for command in commands():
+        text = help_of(command)
         if HELP_ALL in text:
-            text = help_of(verb, option=HELP_ALL)
-        sections.append(f"## amvnet {verb}\n\n```text\n{text}\n```")
+            text = help_of(command, option=HELP_ALL)
+        sections.append(f"## amvnet {command}\n\n```text\n{text}\n```")
     return "\n\n".join(sections)
 
 

@@ -274,7 +274,7 @@ def test_an_output_folder_may_be_a_link() -> None:
         assert (base / "out/real/a/b.label").is_file()
 
 
-VERBS = (
+COMMANDS = (
     "predict nuscenes:{base}/data --weights {weights} --out {base}/out --scores",
     "fuse nuscenes:{base}/data --scores-a {base} --scores-b {base} --out {base}/out",
     "submit nuscenes:{base}/data --predictions {base} --split val --out {base}/out/a.zip",
@@ -290,15 +290,15 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(fresh_weights(NUSCENES), tmp_path_factory.mktemp("weights") / "w.safetensors")
 
 
-@pytest.mark.parametrize("verb", VERBS, ids=lambda verb: verb.split()[0])
-def test_every_verb_refuses_a_token_that_is_a_path(verb: str, weights: Path) -> None:
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split()[0])
+def test_every_command_refuses_a_token_that_is_a_path(command: str, weights: Path) -> None:
     with surroundings(make=with_token("../../../victim/precious")) as base:
-        line = refusal(verb.format(base=base, weights=weights))
+        line = refusal(command.format(base=base, weights=weights))
         assert "'../../../victim/precious'" in line
 
 
 HOSTILE = "../../../victim/precious"
-# Verbs that write files with names of their own, whatever the data say.
+# Commands that write files with names of their own, whatever the data say.
 WRITERS = (
     "view {base}/data/own.yaml --weights {base}/data/w.safetensors --html {base}/out/page.html",
     "export --weights {base}/data/w.safetensors --out {base}/out",
@@ -330,29 +330,29 @@ def make_hostile(folder: Path) -> None:
     save(replace(fresh_weights(taxonomy), sensor=HOSTILE), folder / "w.safetensors")
 
 
-@pytest.mark.parametrize("verb", WRITERS, ids=lambda verb: verb.split()[0])
-def test_names_in_the_data_do_not_lead_a_verb_elsewhere(verb: str) -> None:
+@pytest.mark.parametrize("command", WRITERS, ids=lambda command: command.split()[0])
+def test_names_in_the_data_do_not_lead_a_command_elsewhere(command: str) -> None:
     """Nor does it change what it reads, or leave other files than those of the output."""
-    if verb.startswith("export"):
+    if command.startswith("export"):
         pytest.importorskip("onnxscript")
     with surroundings(make=make_hostile) as base:
-        code, error = run_cli(*verb.format(base=base).split())
+        code, error = run_cli(*command.format(base=base).split())
         assert code in (0, 2), error
         assert code == 0 or "Traceback" not in error
         succeeded = [path for path in (base / "out").rglob("*") if path.is_file()]
         assert (code == 0) == bool(succeeded), error
 
 
-@pytest.mark.parametrize("verb", VERBS[:2], ids=lambda verb: verb.split()[0])
-def test_a_linked_folder_of_the_output_is_refused(verb: str, weights: Path) -> None:
+@pytest.mark.parametrize("command", COMMANDS[:2], ids=lambda command: command.split()[0])
+def test_a_linked_folder_of_the_output_is_refused(command: str, weights: Path) -> None:
     with surroundings("lidarseg", make=with_token("precious")) as base:
         for token in ("precious", "scene-0103-8", "scene-0061-9", "scene-0061-8"):
             scores = base / f"out/scores/lidarseg/mini_val/{token}_lidarseg.npy"
             scores.parent.mkdir(parents=True, exist_ok=True)
             np.save(scores, np.ones((COUNT, 16)))
-        command = verb.replace("{base} ", "{base}/out/scores ")
-        line = refusal(f"{command.format(base=base, weights=weights)} --split mini_val")
-        assert "found a link" in line
+        line = command.replace("{base} ", "{base}/out/scores ")
+        error = refusal(f"{line.format(base=base, weights=weights)} --split mini_val")
+        assert "found a link" in error
 
 
 @pytest.mark.parametrize("link", ["sequences", "sequences/00", "sequences/00/velodyne"])

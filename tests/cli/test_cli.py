@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import amvnet
-from amvnet.cli.main import VERBS, main
+from amvnet.cli.main import COMMANDS, main
 from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.sensors.lidars import SENSORS
@@ -90,7 +90,7 @@ TRAIN_RV = TRAIN + " --stage rv"
 TRAIN_HEAD = TRAIN + " --stage head"
 
 MISTAKES = {
-    "unknown verb": "segment {w}/lone.bin",
+    "unknown command": "segment {w}/lone.bin",
     "no arguments": "predict",
     "no weights": "predict {w}/lone.bin --out {out}",
     "no data": "train {w}/recipe.yaml --out {out}",
@@ -192,20 +192,20 @@ def test_a_broken_scan_leaves_the_others_whole(world: Path, tmp_path: Path) -> N
     assert len(np.fromfile(tmp_path / "lone.label", np.uint32)) == 300
 
 
-def test_without_a_verb_the_usage_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_command_the_usage_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert main(["--help"]) == 0
     usage = capsys.readouterr().out
-    for verb in VERBS:
-        assert f"  {verb} " in usage
+    for command in COMMANDS:
+        assert f"  {command} " in usage
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as leave:
-        main([verb, "--help"])
+        main([command, "--help"])
     assert leave.value.code == 0
-    assert f"amvnet {verb}" in capsys.readouterr().out
+    assert f"amvnet {command}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("order", ["first", "last"])

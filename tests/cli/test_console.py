@@ -135,9 +135,9 @@ def test_the_work_goes_on_without_a_reader(sink: str, world: Path, tmp_path: Pat
     assert expected in error
 
 
-@pytest.mark.parametrize("verb", ["--version", "--help", "predict --help"])
-def test_what_only_speaks_does_not_fail_either(verb: str) -> None:
-    code, _, error = amvnet(f"$AMVNET {verb} > /dev/full")
+@pytest.mark.parametrize("command", ["--version", "--help", "predict --help"])
+def test_what_only_speaks_does_not_fail_either(command: str) -> None:
+    code, _, error = amvnet(f"$AMVNET {command} > /dev/full")
     assert code == 0
     assert error.count("\n") == 1
 

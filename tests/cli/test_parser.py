@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from amvnet.cli.main import VERBS, main
+from amvnet.cli.main import COMMANDS, main
 from amvnet.cli.options import ScanChoice
 from amvnet.cli.parser import field_texts, make_parser, run_with
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
@@ -86,15 +86,15 @@ def test_values_that_begin_with_a_minus_need_no_equals_sign() -> None:
         "--out",
         "o",
     ]
-    values = make_parser("predict", VERBS["predict"]).values(words)
+    values = make_parser("predict", COMMANDS["predict"]).values(words)
     assert values["offset"] == "-1,0,0"
     assert values["height"] == -0.5
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_help_is_in_words(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_in_words(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main([verb, "--help"])
+        main([command, "--help"])
     assert caught.value.code == 0
     text = capsys.readouterr().out
     for word in ("class_path", "init_args", "<class", "Literal[", "null", "type:"):
@@ -115,13 +115,13 @@ def test_the_help_of_train_has_every_value_of_the_recipe_with_its_meaning(
         assert words in text.replace("- ", "-")
 
 
-@pytest.mark.parametrize("verb", ["train", "ablate"])
+@pytest.mark.parametrize("command", ["train", "ablate"])
 def test_help_is_short_and_leaves_the_values_of_the_recipe_to_another_option(
-    verb: str, capsys: pytest.CaptureFixture[str]
+    command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for recipe in ([], ["nuscenes"]):
         with pytest.raises(SystemExit):
-            main([verb, *recipe, "--help"])
+            main([command, *recipe, "--help"])
         lines = capsys.readouterr().out.splitlines()
         assert len(lines) < 100
         flags = [line.split()[0] for line in lines if line.startswith("  --")]
@@ -130,7 +130,7 @@ def test_help_is_short_and_leaves_the_values_of_the_recipe_to_another_option(
 
 
 def test_values_of_the_command_line_replace_those_of_the_recipe() -> None:
-    parser = make_parser("train", VERBS["train"])
+    parser = make_parser("train", COMMANDS["train"])
     add_recipe(parser, Recipe())
     words = ["simulated", "--data", "x", "--out", "o", "--training.rv.lr", "2e-3"]
     words += ["--model.range_net.gru", "false", "--model.point_head.hidden", "[8,4]"]
@@ -162,10 +162,10 @@ def test_an_error_of_the_disk_without_a_reason_says_what_is_known(
     assert "1000 requested and 0 written" in line
 
 
-def test_fields_of_a_dataclass_are_options_and_reach_the_verb_in_it() -> None:
+def test_fields_of_a_dataclass_are_options_and_reach_the_command_in_it() -> None:
     calls: list[tuple[int, ScanChoice]] = []
 
-    def verb(count: int, choice: ScanChoice) -> None:
+    def command(count: int, choice: ScanChoice) -> None:
         """Do nothing.
 
         Args:
@@ -174,9 +174,9 @@ def test_fields_of_a_dataclass_are_options_and_reach_the_verb_in_it() -> None:
         """
         calls.append((count, choice))
 
-    parser = make_parser("verb", verb)
+    parser = make_parser("command", command)
     values = parser.values(["--count", "3", "--split", "val", "--topic", "/a"])
-    run_with(verb, values)
+    run_with(command, values)
     assert calls == [(3, ScanChoice(split="val", topic="/a"))]
 
     help_text = " ".join(parser.format_help().split())

@@ -1,4 +1,4 @@
-"""Exit codes of every verb, and how Ctrl-C and SIGTERM end one: soon, and with one line."""
+"""Exit codes of every command, and how Ctrl-C and SIGTERM end one: soon, and with one line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from amvnet.cli import main as command_line
-from amvnet.cli.main import GOES_ON, VERBS
+from amvnet.cli.main import COMMANDS, GOES_ON
 from amvnet.errors import InputError, SomeBroken
 from amvnet.files import atomic_write, temporary_folder, unfinished
 from amvnet.weights.file import save
@@ -29,18 +29,18 @@ Run = Callable[[str, Sequence[str]], None]
 
 
 def raising(error: BaseException) -> Run:
-    """Return a verb that fails."""
+    """Return a command that fails."""
 
-    def run(verb: str, arguments: Sequence[str]) -> None:
+    def run(command: str, arguments: Sequence[str]) -> None:
         raise error
 
     return run
 
 
 def signalled(number: int, becomes: type[BaseException] | None) -> Run:
-    """Return a verb that gets a signal; the interruption may become another exception, or none."""
+    """Return a command that gets a signal, and may turn the interruption into `becomes`."""
 
-    def run(verb: str, arguments: Sequence[str]) -> None:
+    def run(command: str, arguments: Sequence[str]) -> None:
         try:
             os.kill(os.getpid(), number)
             time.sleep(60)
@@ -52,7 +52,7 @@ def signalled(number: int, becomes: type[BaseException] | None) -> Run:
 
 
 ENDS: dict[str, tuple[Run, int, str]] = {
-    "done": (lambda verb, arguments: None, 0, ""),
+    "done": (lambda command, arguments: None, 0, ""),
     "wrong input": (raising(InputError("expected a, found b; c")), 2, "expected a, found b; c"),
     "some broken": (raising(SomeBroken("1 of 2 scans", ["a: broken"])), 3, "a: broken"),
     "full disk": (raising(OSError(28, "No space left on device", "out")), 1, "No space left"),
@@ -65,20 +65,24 @@ ENDS: dict[str, tuple[Run, int, str]] = {
 
 
 @pytest.mark.parametrize("end", ENDS)
-@pytest.mark.parametrize("verb", VERBS)
-def test_the_exit_code_of_every_verb(verb: str, end: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_exit_code_of_every_command(
+    command: str, end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run, code, words = ENDS[end]
     monkeypatch.setattr(command_line, "run", run)
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    actual, error = run_cli(verb)
+    actual, error = run_cli(command)
 
     assert actual == code
     assert words in error
     assert error.count("\n") == (code != 0) + (code == 3)
     assert before == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     if code > 128:
-        assert ("--resume" in error) == ("resume" in inspect.signature(VERBS[verb]).parameters)
-        assert ("start it again" in error) == (verb in GOES_ON)
+        assert ("--resume" in error) == (
+            "resume" in inspect.signature(COMMANDS[command]).parameters
+        )
+        assert ("start it again" in error) == (command in GOES_ON)
 
 
 def test_the_page_has_all_exit_codes() -> None:
@@ -92,7 +96,7 @@ import sys, time
 from amvnet.cli import main
 from amvnet.files import atomic_write
 
-def run(verb, arguments):
+def run(command, arguments):
     with atomic_write("{path}") as part:
         part.write_text("half")
         print("ready", flush=True)
@@ -109,7 +113,7 @@ sys.exit(main.main())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_verb_that_does_not_end_is_ended(number: int, tmp_path: Path) -> None:
+def test_a_command_that_does_not_end_is_ended(number: int, tmp_path: Path) -> None:
     """It leaves no half file, and says one line."""
     script = STUBBORN.replace("{path}", str(tmp_path / "a.txt"))
     with subprocess.Popen(
@@ -142,7 +146,7 @@ class Finder(MetaPathFinder, Loader):
             os.abort()
 
 sys.meta_path.insert(0, Finder())
-main.run = lambda verb, arguments: __import__("stubborn")
+main.run = lambda command, arguments: __import__("stubborn")
 sys.argv = ["amvnet", "info"]
 sys.exit(main.main())
 """
@@ -188,7 +192,7 @@ from amvnet import read
 from amvnet.cli import main
 from amvnet.files import temporary_folder
 
-def run(verb, arguments):
+def run(command, arguments):
     read("{scan}")  # in a process of its own, which has a temporary folder
     with temporary_folder(Path("{out}")) as folder:
         (folder / "graph").write_text("half")
@@ -202,7 +206,7 @@ sys.exit(main.main())
 """
 
 
-def test_a_stopped_verb_leaves_no_temporary_folder(tmp_path: Path) -> None:
+def test_a_stopped_command_leaves_no_temporary_folder(tmp_path: Path) -> None:
     write_las(tmp_path / "a.laz", some_points())
     (tmp_path / "temporary").mkdir()
     script = TEMPORARY.replace("{scan}", str(tmp_path / "a.laz"))

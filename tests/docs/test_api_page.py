@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import amvnet
-from amvnet.cli.main import VERBS
+from amvnet.cli.main import COMMANDS
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "api.md").read_text(encoding="utf-8")
@@ -45,12 +45,12 @@ def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert pushed == ["me/amvnet"]
 
 
-def test_the_site_has_the_help_of_every_verb() -> None:
+def test_the_site_has_the_help_of_every_command() -> None:
     hook = load_hook()
     written = (DOCS / hook.PAGE).read_text(encoding="utf-8")
     page = SimpleNamespace(file=SimpleNamespace(src_uri=hook.PAGE))
     built = hook.on_page_markdown(written, page)
 
-    assert re.findall(r"## amvnet (\w+)", built) == list(VERBS)
-    for verb in VERBS:
-        assert f"usage: amvnet {verb}" in built
+    assert re.findall(r"## amvnet (\w+)", built) == list(COMMANDS)
+    for command in COMMANDS:
+        assert f"usage: amvnet {command}" in built

@@ -1,4 +1,4 @@
-"""Commands of the pages have verbs and options that there are; the README names all extras."""
+"""The pages use commands and options that exist, and the README names all extras."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import get_args
 
 import pytest
 
-from amvnet.cli.main import VERBS, WITH_RECIPE
+from amvnet.cli.main import COMMANDS, WITH_RECIPE
 from amvnet.cli.parser import make_parser
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
@@ -26,11 +26,11 @@ def test_every_command_can_be_parsed(page: str) -> None:
     for words in commands_of(page):
         if "amvnet" not in words:
             continue
-        verb, *arguments = words[words.index("amvnet") + 1 :]
-        if verb.startswith("--") or arguments[-1:] in (["--help"], [HELP_ALL]):
+        command, *arguments = words[words.index("amvnet") + 1 :]
+        if command.startswith("--") or arguments[-1:] in (["--help"], [HELP_ALL]):
             continue
-        parser = make_parser(verb, VERBS[verb])
-        if verb in WITH_RECIPE:
+        parser = make_parser(command, COMMANDS[command])
+        if command in WITH_RECIPE:
             add_recipe(parser, Recipe())
         parser.values(arguments)
 

@@ -546,9 +546,9 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
     assert not counter.in_memory
 
 
-@pytest.mark.parametrize("verb", ["predict", "evaluate", "bench"])
-def test_every_verb_that_segments_takes_a_precision_and_a_tau(
-    world: Path, tmp_path: Path, verb: str
+@pytest.mark.parametrize("command", ["predict", "evaluate", "bench"])
+def test_every_command_that_segments_takes_a_precision_and_a_tau(
+    world: Path, tmp_path: Path, command: str
 ) -> None:
     inputs = {
         "predict": (world / "data", "--out", tmp_path),
@@ -556,7 +556,7 @@ def test_every_verb_that_segments_takes_a_precision_and_a_tau(
         "bench": ("--runs", 1, "--scan", world / "scans/000000.bin"),
     }
     options = ("--weights", world / "w.safetensors", "--precision", "bfloat16", "--tau", 0.6)
-    assert run_cli(verb, *inputs[verb], *options) == (0, "")
+    assert run_cli(command, *inputs[command], *options) == (0, "")
 
 
 def test_the_commands_of_the_page_run(

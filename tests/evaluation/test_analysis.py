@@ -210,7 +210,7 @@ def test_every_method_is_scored_as_by_the_segmenter(
         np.testing.assert_array_equal(matrices[method][0], of_all_distances)
 
 
-# ---- the verb `analyze`
+# ---- the command `analyze`
 
 
 def test_analyze_writes_each_figure_as_picture_and_table(world: Path) -> None:
@@ -307,7 +307,7 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     assert not files(world / "none")
 
 
-# ---- the verb `ablate`
+# ---- the command `ablate`
 
 
 @dataclass(frozen=True)

@@ -378,10 +378,10 @@ def test_wrong_scans_are_one_line(exported: Exports) -> None:
     fails(lambda: by_elevation(np.full((3, 4), np.nan)), "finite")
 
 
-# ---- the verb
+# ---- the command
 
 
-def test_the_verb_exports_one_network(exported: Exports, tmp_path: Path) -> None:
+def test_the_command_exports_one_network(exported: Exports, tmp_path: Path) -> None:
     weights = without(exported["elevation"].weights, "range_net", "point_head")
     path = save(weights, tmp_path / "w.safetensors")
     succeed(f"export --weights {path} --out {tmp_path}/out")
@@ -395,7 +395,7 @@ def test_the_verb_exports_one_network(exported: Exports, tmp_path: Path) -> None
     assert OnnxSegmenter(tmp_path / "out")(make_scan(1).points).labels.any()
 
 
-def test_mistakes_of_the_verb_are_one_line(exported: Exports, tmp_path: Path) -> None:
+def test_mistakes_of_the_command_are_one_line(exported: Exports, tmp_path: Path) -> None:
     weights = exported["elevation"].weights
     polar_only = save(without(weights, "range_net", "point_head"), tmp_path / "polar.safetensors")
     head_only = save(without(weights, "range_net", "polar_net"), tmp_path / "head.safetensors")

@@ -171,7 +171,7 @@ def test_a_scan_that_takes_all_memory_is_a_broken_one(tmp_path: Path, error: Exc
 
 
 @pytest.mark.parametrize("error", OUT_OF_MEMORY)
-def test_a_verb_without_memory_ends_with_one_line(
+def test_a_command_without_memory_ends_with_one_line(
     world: Path, tmp_path: Path, error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*arguments: object, **options: object) -> None:

@@ -167,15 +167,17 @@ def test_any_number_of_scans_at_a_time_gives_the_same_result(
     np.testing.assert_equal(*results)
 
 
-@pytest.mark.parametrize("verb", ["evaluate", "analyze", "rank", "view"])
-def test_every_command_takes_the_options_of_predict(verb: str, data: Path, tmp_path: Path) -> None:
-    words = [verb, str(data), "--weights", str(data / "w.safetensors")]
+@pytest.mark.parametrize("command", ["evaluate", "analyze", "rank", "view"])
+def test_every_command_takes_the_options_of_predict(
+    command: str, data: Path, tmp_path: Path
+) -> None:
+    words = [command, str(data), "--weights", str(data / "w.safetensors")]
     words += {
         "evaluate": [],
         "analyze": ["--out", str(tmp_path)],
         "rank": ["--out", str(tmp_path / "rank.csv")],
         "view": ["--html", str(tmp_path / "page.html")],
-    }[verb]
+    }[command]
     words += ["--engine", "torch", "--precision", "bfloat16"]
     assert "--at-once" in refusal(shlex.join([*words, "--at-once", "0"]))
     assert run_cli(*words, "--at-once", "2") == (0, "")

@@ -18,7 +18,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 
-from amvnet.cli.main import VERBS
+from amvnet.cli.main import COMMANDS
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -251,8 +251,8 @@ def test_the_page_runs_commands_that_there_are() -> None:
     page = (ROOT / "docs/deployment.md").read_text()
     commands = re.findall(r"docker run .*? (amvnet(?::\w+)?) (\w+)|run --rm \w+ (\w+)", page)
     assert len(commands) >= 3
-    for _, verb, composed_verb in commands:
-        assert verb + composed_verb in VERBS
+    for _, command, composed_command in commands:
+        assert command + composed_command in COMMANDS
     for path in re.findall(r"(?:docker|ros2)/[\w./]+\w", page):
         assert (ROOT / path).exists(), path
 

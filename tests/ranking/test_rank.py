@@ -185,7 +185,7 @@ def test_a_whole_thing_is_more_doubtful_than_the_edge_of_one_and_many_points_tha
     assert rows["score"][0] > 2 * rows["score"][1]
 
 
-# ---- the verb
+# ---- the command
 
 
 @pytest.fixture(scope="module")

@@ -152,16 +152,16 @@ def test_processes_share_the_scans_of_evaluate(world: Path, tmp_path: Path) -> N
         assert (tmp_path / "two" / name).read_bytes() == contents, name
 
 
-@pytest.mark.parametrize("verb", ["train", "analyze"])
+@pytest.mark.parametrize("command", ["train", "analyze"])
 def test_work_that_cannot_be_shared_is_refused_in_one_line(
-    world: Path, tmp_path: Path, verb: str
+    world: Path, tmp_path: Path, command: str
 ) -> None:
     data = world / "data"
     arguments = {
         "train": [world / "recipe.yaml", "--data", data, "--training.rv.batch", 3],
         "analyze": [data, "--weights", world / "run"],
     }
-    result = torchrun(verb, *arguments[verb], "--out", tmp_path / "out")
+    result = torchrun(command, *arguments[command], "--out", tmp_path / "out")
     assert result.returncode != 0
 
     lines = [line for line in result.stderr.splitlines() if line.startswith("amvnet: ")]

@@ -48,7 +48,7 @@ PRINTING = """
 import os, sys
 import amvnet.cli.main as cli
 
-cli.run = lambda verb, arguments: print(
+cli.run = lambda command, arguments: print(
     "torch" in sys.modules, *(os.environ.get(name) for name in sys.argv[1:])
 )
 cli.main(["info"])

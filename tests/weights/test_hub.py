@@ -108,7 +108,7 @@ def test_a_revision_can_be_named(hub: Hub) -> None:
     assert hub.calls[-1] == {"repo_id": "somebody/streets", "revision": "v2"}
 
 
-def test_the_verbs_take_names_of_the_hub(
+def test_the_commands_take_names_of_the_hub(
     hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     amvnet.push(save(fresh_weights(), tmp_path / "w.safetensors"), "somebody/streets")

@@ -1,4 +1,4 @@
-"""The command line: find the verb, parse its arguments, and turn errors into one line."""
+"""The command line: find the command, parse its arguments, and turn errors into one line."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
-# In the order of the help.
+# The functions of the commands, in the order of the help.
 _FIRST = (demo, simulate, check, train, predict, fleet, evaluate, submit, fuse)
 _LAST = (rank, analyze, ablate, export, view, bench, list_names, info)
-VERBS = {run_verb.__name__: run_verb for run_verb in _FIRST + _LAST}
-RESUMED = ("train", "predict", "fleet")  # verbs with --resume
-GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done
-SHARED = ("train", "evaluate", "ablate")  # verbs whose work several processes can share
-WITH_RECIPE = ("train", "ablate")  # verbs whose options are also the values of a recipe
+COMMANDS = {function.__name__: function for function in _FIRST + _LAST}
+RESUMED = ("train", "predict", "fleet")  # commands with --resume
+GOES_ON = ("simulate", "ablate")  # commands that keep what an earlier call has done
+SHARED = ("train", "evaluate", "ablate")  # commands whose work several processes can share
+WITH_RECIPE = ("train", "ablate")  # commands whose options are also the values of a recipe
 
 # Exit codes.
 DONE = 0
@@ -76,19 +76,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _usage() -> str:
-    """Return the help of `amvnet`: what each verb does."""
-    lines = ["usage: amvnet VERB ...", ""]
-    for verb, run_verb in VERBS.items():
-        lines.append(f"  {verb:<10} {first_line(run_verb)}")
-    return "\n".join([*lines, "", f"`amvnet VERB --help` says more. Version {__version__}."])
+    """Return the help of `amvnet`: what each command does."""
+    lines = ["usage: amvnet COMMAND ...", ""]
+    for command, function in COMMANDS.items():
+        lines.append(f"  {command:<10} {first_line(function)}")
+    return "\n".join([*lines, "", f"`amvnet COMMAND --help` says more. Version {__version__}."])
 
 
 def _last_words(arguments: Sequence[str]) -> str:
-    """Return what is said if the verb is stopped: whether it can go on."""
-    verb = arguments[0] if arguments else ""
-    if verb in RESUMED:
+    """Return what is said if the command is stopped: whether it can go on."""
+    command = arguments[0] if arguments else ""
+    if command in RESUMED:
         return "stopped; go on with --resume"
-    if verb in GOES_ON:
+    if command in GOES_ON:
         return "stopped; start it again to go on"
     return "stopped"
 
@@ -121,34 +121,34 @@ def _run_and_explain(arguments: Sequence[str]) -> int:
     return DONE
 
 
-def run(verb: str, arguments: Sequence[str]) -> None:
-    """Run one verb.
+def run(command: str, arguments: Sequence[str]) -> None:
+    """Run one command.
 
     Raises:
-        InputError: if the verb, its arguments, or the files that they name cannot be used.
+        InputError: if the command, its arguments, or the files that they name cannot be used.
         SomeBroken: if some of several scans are broken.
     """
-    if verb not in VERBS:
+    if command not in COMMANDS:
         raise InputError(
-            f"expected a verb of amvnet, found {verb!r}"
-            + did_you_mean(verb, VERBS, "see amvnet --help")
+            f"expected a command of amvnet, found {command!r}"
+            + did_you_mean(command, COMMANDS, "see amvnet --help")
         )
-    if verb not in SHARED and _has_several_processes():
+    if command not in SHARED and _has_several_processes():
         raise InputError(
-            f"expected one of {', '.join(SHARED)} for several processes, found {verb}; "
+            f"expected one of {', '.join(SHARED)} for several processes, found {command}; "
             "run it in one process"
         )
 
     _suppress_library_warnings()
-    if verb in WITH_RECIPE:
-        values = _parse_with_recipe(verb, arguments)
+    if command in WITH_RECIPE:
+        values = _parse_with_recipe(command, arguments)
     else:
-        values = make_parser(verb, VERBS[verb]).values(arguments)
-    run_with(VERBS[verb], values)
+        values = make_parser(command, COMMANDS[command]).values(arguments)
+    run_with(COMMANDS[command], values)
 
 
-def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
-    """Parse the arguments of a verb with a recipe, whose values the options replace."""
+def _parse_with_recipe(command: str, arguments: Sequence[str]) -> dict[str, Any]:
+    """Parse the arguments of a command with a recipe, whose values the options replace."""
     from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
     from amvnet.config.recipes import load_recipe
     from amvnet.config.schema import Recipe
@@ -158,7 +158,7 @@ def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
     names_recipe = bool(arguments) and not arguments[0].startswith("-")
     shown = load_recipe(arguments[0]) if asks_for_help and names_recipe else Recipe()
 
-    parser = make_parser(verb, VERBS[verb])
+    parser = make_parser(command, COMMANDS[command])
     add_recipe(parser, shown, shows_all=HELP_ALL in arguments)
     values = parser.values(arguments)
     values["recipe"] = with_options(load_recipe(values["recipe"]), values)

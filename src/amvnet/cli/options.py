@@ -1,4 +1,4 @@
-"""Options that several verbs have, the scans that they choose, and the processes of a verb."""
+"""Options that several commands share, the scans they choose, and the processes they start."""
 
 from __future__ import annotations
 

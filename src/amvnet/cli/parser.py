@@ -1,4 +1,4 @@
-"""Make the parser of a verb from the signature and the docstring of its function."""
+"""Make the parser of a command from the signature and the docstring of its function."""
 
 from __future__ import annotations
 
@@ -157,8 +157,8 @@ def literals(kind: Any) -> tuple[str, ...]:
     return ()
 
 
-def make_parser(verb: str, run: Callable[..., None]) -> Parser:
-    """Return the parser of a verb, without the values of a recipe.
+def make_parser(command: str, run: Callable[..., None]) -> Parser:
+    """Return the parser of a command, without the values of a recipe.
 
     Args:
         run: does the work; its signature and docstring define the arguments and options.
@@ -167,7 +167,7 @@ def make_parser(verb: str, run: Callable[..., None]) -> Parser:
     """
     docs = docstring_parser.parse(run.__doc__ or "")
     texts = {param.arg_name: param.description or "" for param in docs.params}
-    parser = Parser(prog=f"amvnet {verb}", description=docs.short_description)
+    parser = Parser(prog=f"amvnet {command}", description=docs.short_description)
 
     metavars = []
     hints = get_type_hints(run, include_extras=True)
@@ -190,12 +190,12 @@ def make_parser(verb: str, run: Callable[..., None]) -> Parser:
             parser.kinds[name] = kind
             _add_option(parser, name, kind, parameter.default, texts.get(name, ""))
 
-    parser.usage = " ".join(["amvnet", verb, *metavars, "[options]"])
+    parser.usage = " ".join(["amvnet", command, *metavars, "[options]"])
     return parser
 
 
 def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
-    """Run a verb with the values of its options, some of which are fields of dataclasses."""
+    """Run a command with the values of its options, some of which are fields of dataclasses."""
     hints = get_type_hints(run)
     arguments = []
     for name in inspect.signature(run).parameters:
@@ -214,7 +214,7 @@ def _is_bundle(kind: Any) -> bool:
 
 
 def _add_argument(parser: Parser, name: str, kind: Any, metavar: str, text: str) -> None:
-    """Add a positional-only parameter of a verb to the parser."""
+    """Add a positional-only parameter of a command to the parser."""
     nargs = None
     if get_origin(kind) is list:
         nargs = "+"
@@ -224,7 +224,7 @@ def _add_argument(parser: Parser, name: str, kind: Any, metavar: str, text: str)
 
 
 def _add_option(target: Any, name: str, kind: Any, default: Any, text: str) -> None:
-    """Add one parameter of a verb as an option to the parser, or to a group of it."""
+    """Add one parameter of a command as an option to the parser, or to a group of it."""
     options: dict[str, Any] = {"help": text.replace("%", "%%")}
     if default is inspect.Parameter.empty:
         options["required"] = True

@@ -15,15 +15,15 @@ from types import FrameType
 from amvnet.cli.console import complain, console, stdout
 from amvnet.files import unfinished
 
-PATIENCE = 0.6  # seconds in which a verb may end by itself
+PATIENCE = 0.6  # seconds in which a command may end by itself
 
 
 class Stop:
-    """Whether a signal has asked the verb to stop, and how it stops.
+    """Whether a signal has asked the command to stop, and how it stops.
 
     Args:
-        line: what is said when the verb has stopped.
-        exits: whether this process belongs to the command line, and ends with the verb.
+        line: what is said when the command has stopped.
+        exits: whether this process belongs to the command line, and ends with the command.
     """
 
     def __init__(self, line: str, exits: bool) -> None:
@@ -40,7 +40,7 @@ class Stop:
         return 128 + self.signal
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Raise KeyboardInterrupt; the process exits if that does not end the verb soon."""
+        """Raise KeyboardInterrupt; the process exits if that does not end the command soon."""
         if os.getpid() != self._process:  # a worker has this handler from the process that forked
             os._exit(128 + number)
         is_second = self.signal is not None
@@ -55,14 +55,14 @@ class Stop:
         raise KeyboardInterrupt
 
     def _insist(self) -> None:
-        """End the processes that the verb may be waiting for, and then this one."""
+        """End the processes that the command may be waiting for, and then this one."""
         for child in multiprocessing.active_children():
             child.kill()
         time.sleep(PATIENCE / 3)
         self.end()
 
     def end(self) -> None:
-        """Say that the verb has stopped; end the process if it is the command line's.
+        """Say that the command has stopped; end the process if it is the command line's.
 
         It leaves no half-written file. Threads that still compute are not waited for.
         """

@@ -1,4 +1,4 @@
-"""The verb `ablate`."""
+"""The command `ablate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb `analyze`."""
+"""The command `analyze`."""
 
 from __future__ import annotations
 

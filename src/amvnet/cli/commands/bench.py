@@ -1,4 +1,4 @@
-"""The verb `bench`."""
+"""The command `bench`."""
 
 from __future__ import annotations
 

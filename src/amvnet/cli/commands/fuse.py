@@ -1,4 +1,4 @@
-"""The verb `fuse`."""
+"""The command `fuse`."""
 
 from __future__ import annotations
 

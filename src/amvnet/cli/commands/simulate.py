@@ -1,4 +1,4 @@
-"""The verb `simulate`."""
+"""The command `simulate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb `submit`."""
+"""The command `submit`."""
 
 from __future__ import annotations
 

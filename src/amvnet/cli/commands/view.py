@@ -1,4 +1,4 @@
-"""The verb `view`."""
+"""The command `view`."""
 
 from __future__ import annotations
 
