@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from amvnet.cli.console import complain, say
+from amvnet.cli.console import report, report_fault
 from amvnet.errors import without_secrets
 
 SECRETS = {
@@ -46,8 +46,8 @@ def test_all_else_stays() -> None:
 
 def test_nothing_that_is_printed_has_secrets(capsys: pytest.CaptureFixture[str]) -> None:
     for text in SECRETS:
-        say(f"found {text}")
-        complain(f"found {text}")
+        report(f"found {text}")
+        report_fault(f"found {text}")
     printed = "".join(capsys.readouterr())
     for secret in ("KEY", "SECRET", "SEC/RET", "SEC%2FRET", "SEC@RET"):
         assert secret not in printed

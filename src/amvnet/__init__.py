@@ -12,7 +12,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from amvnet.progress import Say, say_nothing
+from amvnet.progress import Reporter, report_nothing
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -61,7 +61,7 @@ def load(
     tau: float | None = None,
     *,
     graphs: bool = True,
-    say: Say = say_nothing,
+    report: Reporter = report_nothing,
 ) -> Segmenter:
     """Return a segmenter with trained weights.
 
@@ -84,7 +84,7 @@ def load(
         tau: points whose class probabilities by the two networks have a cosine similarity of at
             most this are uncertain, in [0, 1]; None takes the threshold of the weights.
         graphs: on a GPU, capture the networks as CUDA graphs.
-        say: called with a line about the device, and with one before work that takes long.
+        report: called with a line that names the device, and with a line before long work.
 
     Raises:
         InputError: if there are no such weights, they lack a part that the method needs, there is
@@ -110,11 +110,11 @@ def load(
         check_choice(engine, device, precision)
         check_method(method, loaded.parts)  # an export takes long
         is_int8 = engine == "int8"
-        networks = cached_networks(loaded, SIMULATED if is_int8 else None, say)
+        networks = cached_networks(loaded, SIMULATED if is_int8 else None, report)
         made = OnnxEngine(loaded, networks, method, tau, int8=is_int8)
 
     segmenter = Segmenter(loaded, made)
-    say(f"computing on {made.hardware} in {made.precision}")
+    report(f"computing on {made.hardware} in {made.precision}")
     return segmenter
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 Progress = Callable[[int, int], None]  # takes the number of things done, and their total
-Say = Callable[[str], None]  # takes a line to print
+Reporter = Callable[[str], None]  # takes a line about what happens, such as `print`
 
 QUIET_SECONDS = 20  # time from the start in which no line is due, seconds
 
@@ -40,5 +40,5 @@ def no_progress(done: int, total: int) -> None:
     """Report nothing."""
 
 
-def say_nothing(line: str) -> None:
+def report_nothing(line: str) -> None:
     """Print nothing."""

@@ -38,7 +38,7 @@ def lines_at(monkeypatch: pytest.MonkeyPatch) -> LinesAt:
         lines: list[tuple[float, str]] = []
         for module in (console, progress):
             monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-        monkeypatch.setattr(console, "say", lambda line: lines.append((now[0], line)))
+        monkeypatch.setattr(console, "report", lambda line: lines.append((now[0], line)))
         step = console.ProgressLines("segmenting")
         for done in range(total + 1):
             now[0] = seconds * done
@@ -79,8 +79,8 @@ def test_a_printed_text_is_one_line_that_is_printable(text: str) -> None:
 
 def test_escapes_in_names_do_not_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     name = "a\x1b[2J\nb\u202e :warning: [red]"
-    console.say(name)
-    console.complain(name)
+    console.report(name)
+    console.report_fault(name)
     table = Table(title=name)
     table.add_row(name)
     console.show(table)
@@ -93,8 +93,8 @@ def test_escapes_in_names_do_not_reach_the_terminal(capsys: pytest.CaptureFixtur
 
 
 def test_long_texts_are_shortened(capsys: pytest.CaptureFixture[str]) -> None:
-    console.say("x" * 3_000_000)
-    console.say_lines("x\n" * 100_000)
+    console.report("x" * 3_000_000)
+    console.report_lines("x\n" * 100_000)
     out = capsys.readouterr().out
     assert "(3,000,000 characters)" in out
     assert "more lines)" in out

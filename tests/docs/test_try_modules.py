@@ -94,7 +94,7 @@ def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
 def normalised(case: Case) -> tuple[Scan, str]:
     """Return the scan as the package normalises it, and what it says."""
     lines: list[str] = []
-    normaliser = Normaliser(case.expected, say=lines.append)
+    normaliser = Normaliser(case.expected, report=lines.append)
     cloud = read_file(case.file, ending_of(case.file), UNKNOWN)
     normaliser.expect("scans", lambda: cloud)
     scan = normaliser(cloud, "scans")

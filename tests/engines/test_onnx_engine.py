@@ -107,7 +107,7 @@ def test_onnx_takes_the_fastest_provider_that_is_installed_and_int8_the_cpu(
     monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
 
     said: list[str] = []
-    amvnet.load(WEIGHTS, engine="onnx", say=said.append)
+    amvnet.load(WEIGHTS, engine="onnx", report=said.append)
     assert opened == [expected, expected]
     (line,) = said
     assert ("Provider" in line) == (len(expected) > 1)
@@ -136,7 +136,7 @@ def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
     expected = amvnet.load(weights)(scan).labels
     said: list[str] = []
     for _ in range(2):
-        segmenter = amvnet.load(weights, engine="int8", say=said.append)
+        segmenter = amvnet.load(weights, engine="int8", report=said.append)
         assert segmenter.engine.name == "int8"
     assert sum("calibrated" in line for line in said) == 1
 

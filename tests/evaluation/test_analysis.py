@@ -24,7 +24,7 @@ from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.timing import run_once
 from amvnet.models.methods import arithmetic_mean, maximum
-from amvnet.progress import Say, say_nothing
+from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import Processes
 from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES
 from amvnet.training import ablation
@@ -318,7 +318,7 @@ class PlanOfTwo:
     out: Path
     scans: Any
     processes: Processes
-    say: Say = say_nothing
+    report: Reporter = report_nothing
 
 
 def test_ablate_scores_on_the_gpu_of_its_process(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from amvnet.data.formats import find
 from amvnet.data.formats.cloud import Cloud
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
-from amvnet.inference.predict import ADVICE, report
+from amvnet.inference.predict import ADVICE, report_certainty
 from amvnet.inference.reading import array_scan, normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
@@ -45,7 +45,7 @@ def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]
     """Return the normalised scans of a folder, the titles of their sensors, and what was said."""
     lines: list[str] = []
     inputs, _ = list_inputs(
-        [str(folder)], normaliser=normaliser_for(weights_for(), say=lines.append)
+        [str(folder)], normaliser=normaliser_for(weights_for(), report=lines.append)
     )
     scans = {scan.name: scan.load().scan for scan in inputs}
     return scans, {scan.name: scan.source for scan in inputs}, lines
@@ -105,7 +105,7 @@ def test_a_sensor_that_misses_points_is_still_the_same_one(tmp_path: Path) -> No
 
 def said(entries: list[Entry], usual: float = 0.1) -> list[str]:
     lines: list[str] = []
-    report(entries, usual, lines.append)
+    report_certainty(entries, usual, lines.append)
     return lines
 
 

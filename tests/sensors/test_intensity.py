@@ -142,7 +142,7 @@ def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
         clouds.append(Cloud(points[:, :3], scale * points[:, 3], name=f"scan {seed}"))
 
     lines: list[str] = []
-    normaliser = normaliser_for(weights_with({}), say=lines.append)
+    normaliser = normaliser_for(weights_with({}), report=lines.append)
     for cloud in clouds:
         normaliser.expect("a", partial(replace, cloud))
     for cloud in clouds:

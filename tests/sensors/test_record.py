@@ -143,5 +143,5 @@ def test_a_weights_file_keeps_the_record(tmp_path: Path) -> None:
     loaded = load(save(weights, tmp_path / "w.safetensors"))
     assert trained_sensor(loaded.training, loaded.sensor).height == pytest.approx(2.6, abs=0.05)
     lines: list[str] = []
-    normaliser = normaliser_for(loaded, say=lines.append)
+    normaliser = normaliser_for(loaded, report=lines.append)
     assert normaliser.target()["height"] == trained_sensor(loaded.training, "").height

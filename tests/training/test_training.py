@@ -181,7 +181,7 @@ def test_the_check_of_the_scans_reports_ten_times_and_only_once(
     dataset = open_dataset(str(make_streets(tmp_path / "data", ("00", "08"), 23)))
     scans = TrainingScans(dataset, dataset.records(["00"]), [])
     lines: list[str] = []
-    plan = Plan(load_recipe("semantickitti-compact"), scans, tmp_path / "run", say=lines.append)
+    plan = Plan(load_recipe("semantickitti-compact"), scans, tmp_path / "run", report=lines.append)
     counts = [check_data(plan).tolist() for _ in range(2)]  # the second time from the cache
     assert counts[0] == counts[1]
     checked = [line for line in lines if line.startswith("checked")]

@@ -82,13 +82,13 @@ class CloudSegmenter:
     Args:
         settings: the parameters of the node.
         topic: where the messages come from, for messages to people.
-        say: called once with what was assumed about the sensor.
+        report: called once with what was assumed about the sensor.
 
     Raises:
         InputError: if a parameter is wrong.
     """
 
-    def __init__(self, settings: Settings, topic: str, say: Callable[[str], None]) -> None:
+    def __init__(self, settings: Settings, topic: str, report: Callable[[str], None]) -> None:
         # Imported late: the node sets the environment before torch reads it.
         import torch
 
@@ -114,7 +114,7 @@ class CloudSegmenter:
         self.hardware = segmenter.engine.hardware
         self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
-        self._normalise = normaliser_for(segmenter.weights, sensor, say)
+        self._normalise = normaliser_for(segmenter.weights, sensor, report)
         self._segment = segmenter
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)
 

@@ -63,7 +63,7 @@ class SafeStream:
             if not isinstance(error, OSError) or self.name == "stderr":
                 return
             if error.errno != errno.EPIPE:  # a reader such as head has read enough
-                complain(f"stdout cannot be written ({error.strerror}); the work goes on")
+                report_fault(f"stdout cannot be written ({error.strerror}); the work goes on")
 
 
 stdout = SafeStream("stdout")
@@ -71,18 +71,18 @@ stderr = SafeStream("stderr")
 console = Console(file=stdout, markup=False, emoji=False, highlight=False)  # type: ignore[arg-type]
 
 
-def say(line: str) -> None:
+def report(line: str) -> None:
     """Print a line without wrapping it, because paths are copied from it."""
     console.print(printable(line), soft_wrap=True)
 
 
-def say_lines(text: str) -> None:
+def report_lines(text: str) -> None:
     """Print a text of several lines."""
     lines = text.split("\n")
     for line in lines[:MOST_LINES]:
-        say(line)
+        report(line)
     if len(lines) > MOST_LINES:
-        say(f"... ({len(lines) - MOST_LINES} more lines)")
+        report(f"... ({len(lines) - MOST_LINES} more lines)")
 
 
 def show(table: RenderableType) -> None:
@@ -96,10 +96,10 @@ def show(table: RenderableType) -> None:
     )
     with plain.capture() as captured:
         plain.print(table)
-    say_lines(captured.get().rstrip("\n"))
+    report_lines(captured.get().rstrip("\n"))
 
 
-def complain(line: str) -> None:
+def report_fault(line: str) -> None:
     """Print a line about a fault to stderr."""
     stderr.write(f"amvnet: {printable(line)}\n")
     stderr.flush()
@@ -161,7 +161,7 @@ class ProgressLines:
     def __call__(self, done: int, total: int) -> None:
         if self.tenths.ends(done, total):
             pace = self._pace(done, total, time.monotonic() - self.start)
-            say(f"{self.title}: {done} of {total}, {pace}")
+            report(f"{self.title}: {done} of {total}, {pace}")
 
     def _pace(self, done: int, total: int, elapsed: float) -> str:
         """Return the rate and the time left: "2.1 a second, 0:01:16 left"."""

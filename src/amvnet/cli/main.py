@@ -26,7 +26,7 @@ from amvnet.cli.commands.simulate import simulate
 from amvnet.cli.commands.submit import submit
 from amvnet.cli.commands.train import train
 from amvnet.cli.commands.view import view
-from amvnet.cli.console import complain, say, say_lines, stdout
+from amvnet.cli.console import report, report_fault, report_lines, stdout
 from amvnet.cli.parser import first_line, make_parser, run_with
 from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
@@ -96,27 +96,27 @@ def _last_words(arguments: Sequence[str]) -> str:
 def _run_and_explain(arguments: Sequence[str]) -> int:
     """Run the command line, print its errors, and return the exit code."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        say_lines(_usage())
+        report_lines(_usage())
         return DONE if arguments else WRONG_INPUT
     if arguments[0] == "--version":
-        say(__version__)
+        report(__version__)
         return DONE
 
     try:
         with memory_for(f"amvnet {arguments[0]}"):
             run(arguments[0], arguments[1:])
     except InputError as error:
-        complain(str(error))
+        report_fault(str(error))
         return WRONG_INPUT
     except SomeBroken as error:
         for fault in error.faults:
-            complain(fault)
-        complain(str(error))
+            report_fault(fault)
+        report_fault(str(error))
         return SOME_BROKEN
     except OSError as error:  # a full disk, for example; earlier files are still whole
         # Some libraries raise an error without its parts.
         place = error.filename or "the disk"
-        complain(f"{place}: {error.strerror or error}; fix this and run it again")
+        report_fault(f"{place}: {error.strerror or error}; fix this and run it again")
         return FAILED
     return DONE
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from amvnet.cli.console import say, silence
+from amvnet.cli.console import report, silence
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute, MethodName
@@ -82,7 +82,7 @@ class LabelledChoice:
         text = f"labelled scans: {describe_records(records)}"
         if len(records) < len(chosen):
             text += f"; {len(chosen) - len(records)} others have no labels"
-        say(text)
+        report(text)
         return records
 
 
@@ -106,12 +106,12 @@ class TrainingChoice:
 
         scans = split_records(dataset, self.train_sequences, self.val_sequences, with_val)
         if scans.unlabelled:
-            say(f"skipped, as they have no labels: {describe_records(scans.unlabelled)}")
+            report(f"skipped, as they have no labels: {describe_records(scans.unlabelled)}")
         if isinstance(dataset, OwnScans):
             used = {record.name for record in (*scans.train, *scans.val)}
             unnamed = [record for record in dataset.left_out() if record.name not in used]
             if unnamed:
-                say(f"not used, as the split does not name them: {describe_records(unnamed)}")
+                report(f"not used, as the split does not name them: {describe_records(unnamed)}")
         return scans
 
     def splits(self, dataset: Dataset) -> Iterator[tuple[str, Sequence[ScanRecord]]]:
@@ -256,7 +256,7 @@ def load_segmenter(
         compute.precision,
         compute.engine,
         tau=tau,
-        say=say,
+        report=report,
     )
     if compute.at_once is not None:
         segmenter.at_once = compute.at_once

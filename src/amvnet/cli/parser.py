@@ -13,7 +13,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 import docstring_parser
 
-from amvnet.cli.console import say_lines
+from amvnet.cli.console import report_lines
 from amvnet.config.bounds import Range
 from amvnet.errors import InputError, did_you_mean, shown
 
@@ -58,7 +58,7 @@ class Parser(argparse.ArgumentParser):
         raise InputError(line if line.endswith("?") else f"{line}; see {self.prog} --help")
 
     def print_help(self, file: Any = None) -> None:
-        say_lines(self.format_help().rstrip())
+        report_lines(self.format_help().rstrip())
 
     def values(self, arguments: Sequence[str]) -> dict[str, Any]:
         """Return the values of all arguments and options by name, in their types.

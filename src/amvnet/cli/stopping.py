@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from amvnet.cli.console import complain, console, stdout
+from amvnet.cli.console import console, report_fault, stdout
 from amvnet.files import unfinished
 
 PATIENCE = 0.6  # seconds in which a command may end by itself
@@ -68,7 +68,7 @@ class Stop:
         """
         if not self._ending.acquire(blocking=False):
             return
-        complain(self.line)
+        report_fault(self.line)
         if not self.exits:
             return
 

@@ -26,14 +26,14 @@ from amvnet.export.onnx import OPSET, check_libraries, export
 from amvnet.files import unfinished
 from amvnet.models.methods import widest_method
 from amvnet.onnx_runner import read_description, read_graph
-from amvnet.progress import Say, say_nothing
+from amvnet.progress import Reporter, report_nothing
 from amvnet.weights.file import Weights
 
 ATTEMPTS = 10  # to give a folder its name while other processes do the same
 
 
 def cached_networks(
-    weights: Weights, int8: str | None = None, say: Say = say_nothing
+    weights: Weights, int8: str | None = None, report: Reporter = report_nothing
 ) -> ExportedNetworks:
     """Return the graphs of some weights from the cache; export them if the cache lacks them.
 
@@ -43,7 +43,7 @@ def cached_networks(
 
     Args:
         int8: as `export` takes it.
-        say: called with a line before work that takes long.
+        report: called with a line before long work.
 
     Raises:
         InputError: as `export`.
@@ -53,7 +53,7 @@ def cached_networks(
     folder = user_cache() / "onnx" / _key(weights, int8)
     shared = shared_with_others(folder)
     if shared is not None:
-        say(
+        report(
             f"{shared}: expected a cache that no other user can write, found one that others can; "
             f"the networks are {exported} for this run alone; correct its owner and mode, or set "
             f"{CACHE} to a folder of yours"
@@ -65,7 +65,7 @@ def cached_networks(
     with suppress(InputError):
         return ExportedNetworks(_read(folder, weights), folder)
     found = "" if not folder.exists() else ", because files in the cache were missing or changed"
-    say(f"the networks are {exported}{found}, once for these weights; kept in {folder}")
+    report(f"the networks are {exported}{found}, once for these weights; kept in {folder}")
     return ExportedNetworks(_export(weights, int8, folder), folder)
 
 

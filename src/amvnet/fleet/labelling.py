@@ -37,7 +37,7 @@ from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import AHEAD
 from amvnet.inference.segmentation import Segmentation, uncertain_share
 from amvnet.models.methods import Compute
-from amvnet.progress import Say, say_nothing
+from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
 
 TRANSFERS = 8  # files that are read from, or written to, object storage at the same time
@@ -211,8 +211,8 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     return describe_drive(source, assumed[0] if assumed else "", usual)
 
 
-def _make_reader(request: LabellingRequest, say: Say = say_nothing) -> FileReader:
-    return FileReader(normaliser_for(request.weights, request.sensor, say))
+def _make_reader(request: LabellingRequest, report: Reporter = report_nothing) -> FileReader:
+    return FileReader(normaliser_for(request.weights, request.sensor, report))
 
 
 @contextmanager

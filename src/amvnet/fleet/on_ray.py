@@ -28,10 +28,10 @@ from amvnet.fleet.results import DRIVES, DRIVES_SCHEMA, Results, describe_drive,
 from amvnet.fleet.storage import Place
 from amvnet.inference.journal import Entry
 from amvnet.inference.pipeline import check_faults
-from amvnet.inference.predict import report
+from amvnet.inference.predict import report_certainty
 from amvnet.inference.request import LabellingRequest
 from amvnet.models.methods import METHODS, Compute
-from amvnet.progress import Progress, Say, no_progress, say_nothing
+from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.sensors.measure import MEASURED
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
@@ -79,7 +79,7 @@ def label_fleet(
     *,
     resume: bool = False,
     progress: Progress = no_progress,
-    say: Say = say_nothing,
+    report: Reporter = report_nothing,
 ) -> int:
     """Label scan files on a Ray cluster, and write a table of results.
 
@@ -88,7 +88,7 @@ def label_fleet(
         request: how the scans are labelled, and what is written.
         out: URL or path of the output folder.
         resume: go on with an earlier run into the same folder.
-        say: takes lines about what was assumed of the sensors, and how sure the labels are.
+        report: takes lines about what was assumed of the sensors, and how sure the labels are.
 
     Returns:
         The number of label files of these scans that exist, counted in the output folder.
@@ -108,7 +108,7 @@ def label_fleet(
     request = replace(request, precision=_precision(request, cluster, resources))
     results = Results(place, request, resume=resume)
 
-    run = FleetRun(request, results, cluster, resources, progress, say)
+    run = FleetRun(request, results, cluster, resources, progress, report)
     try:
         for window in _windows(chain([first], tables)):
             remaining = run.plan(window)
@@ -148,14 +148,14 @@ class FleetRun:
         cluster: Cluster,
         resources: dict[str, Any],
         progress: Progress = no_progress,
-        say: Say = say_nothing,
+        report: Reporter = report_nothing,
     ) -> None:
         self.request = request
         self.results = results
         self.cluster = cluster
         self.resources = resources
         self._progress = progress
-        self._say = say
+        self._report = report
         self._paths = NameSet()  # that are written
         self._names = NameSet()
         self._planned = 0
@@ -200,10 +200,10 @@ class FleetRun:
 
     def _say_assumed(self, rows: Sequence[dict[str, Any]]) -> None:
         for row in rows[:SAID]:
-            self._say(row["assumed"] or f"{row['drive']}: expected scans to measure, found none")
+            self._report(row["assumed"] or f"{row['drive']}: expected scans to measure, found none")
         if len(rows) > SAID:
             place = self.results.folder / DRIVES
-            self._say(f"what is assumed of {len(rows) - SAID} more drives is in {place.url}")
+            self._report(f"what is assumed of {len(rows) - SAID} more drives is in {place.url}")
 
     def label(self, scans: pa.Table) -> None:
         """Label scans of drives that are measured.
@@ -324,7 +324,7 @@ class FleetRun:
         if METHODS[self.request.method].has_two_networks:
             usual = self.request.weights.usual_uncertain_at(self.request.tau)
             drives = [Entry("", "", drive, points[drive], uncertain[drive]) for drive in points]
-            report(drives, usual, self._say)
+            report_certainty(drives, usual, self._report)
         check_faults(faults, len(self._names))
         return written
 

@@ -16,7 +16,7 @@ from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS
-from amvnet.progress import Progress, Say, no_progress, say_nothing
+from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.scan import Scan
 
 NAMED = 10  # doubtful recordings, each in a line
@@ -40,7 +40,7 @@ def predict(
     resume: bool = False,
     also_read: Sequence[Path | str | None] = (),
     progress: Progress = no_progress,
-    say: Say = say_nothing,
+    report: Reporter = report_nothing,
 ) -> int:
     """Segment datasets, scan files, bags and folders of them.
 
@@ -54,7 +54,7 @@ def predict(
         overwrite: replace files that exist.
         resume: leave out the scans that an earlier run with an equal request has done.
         also_read: files besides the scans that the command reads, which are not written.
-        say: takes lines about what was assumed of the sensor, and at the end how sure the labels
+        report: takes lines about what was assumed of the sensor, and at the end how sure the labels
             are, if there are two networks.
 
     Returns:
@@ -67,7 +67,7 @@ def predict(
     """
     request = replace(request, precision=segmenter.engine.precision)  # not "auto"
     classes = request.classes
-    normaliser = normaliser_for(request.weights, request.sensor, say)
+    normaliser = normaliser_for(request.weights, request.sensor, report)
     options = ScanOptions(sequences, split, request.topic, request.layout)
     scans, taxonomy = list_inputs(inputs, options, segmenter.taxonomy, normaliser)
     if classes is not None:
@@ -89,11 +89,11 @@ def predict(
         names = {str(scan.scores_path) for scan in scans}
         other_run = describe_other_run(folder, request.settings, names)
         if other_run:
-            say(f"warning: {other_run}")
+            report(f"warning: {other_run}")
     entries, faults = pipeline.run(request.settings, progress)
 
     if METHODS[segmenter.method].has_two_networks:
-        report(entries, segmenter.usual_uncertain, say)
+        report_certainty(entries, segmenter.usual_uncertain, report)
     check_faults(faults, len(scans))
     return len(scans)
 
@@ -115,7 +115,7 @@ def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment
     return segment
 
 
-def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
+def report_certainty(entries: Sequence[Entry], usual: float | None, report: Reporter) -> None:
     """Say how sure the labels are, which recordings have doubtful ones, and what to try."""
     points: Counter[str] = Counter()
     uncertain: Counter[str] = Counter()
@@ -134,12 +134,12 @@ def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
 
     verdict = Verdict(uncertain.total() / points.total(), usual)
     if len(points) == 1 or not doubtful:
-        say(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else verdict.shares)
+        report(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else verdict.shares)
         return
 
-    say(verdict.shares)
+    report(verdict.shares)
     for sensor in list(doubtful)[:NAMED]:
-        say(f"warning: {sensor}: {doubtful[sensor]}")
+        report(f"warning: {sensor}: {doubtful[sensor]}")
     others = len(doubtful) - NAMED
     more = f"as in {others} more; " if others > 0 else ""
-    say(f"warning: {more}{ADVICE}")
+    report(f"warning: {more}{ADVICE}")

@@ -12,7 +12,7 @@ from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.cloud import require_columns
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
-from amvnet.progress import Say, say_nothing
+from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
 from amvnet.sensors.lidars import Sensor, make_sensor
@@ -99,15 +99,15 @@ def _check_shape(array: np.ndarray) -> None:
 
 
 def normaliser_for(
-    weights: Weights, sensor: Sensor | None = None, say: Say = say_nothing
+    weights: Weights, sensor: Sensor | None = None, report: Reporter = report_nothing
 ) -> Normaliser:
     """Return what normalises scan files for some weights.
 
     Args:
         sensor: what is known of the sensor; the rest is measured.
-        say: takes a line about what was assumed of the sensor.
+        report: takes a line about what was assumed of the sensor.
     """
-    return Normaliser(expectation_of(weights), sensor, say)
+    return Normaliser(expectation_of(weights), sensor, report)
 
 
 def expectation_of(weights: Weights) -> Expectation:

@@ -163,7 +163,7 @@ class Segmenter:
     ) -> tuple[Sequence[InputScan], list[str]]:
         """Return the scans of a path, and a list that receives what is assumed of them."""
         assumed: list[str] = []
-        normaliser = normaliser_for(self.weights, say=assumed.append)
+        normaliser = normaliser_for(self.weights, report=assumed.append)
         options = ScanOptions(topic=topic, layout=layout)
         scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
         return scans, assumed

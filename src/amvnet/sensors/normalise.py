@@ -14,7 +14,7 @@ from amvnet.data.laser_order import lasers_by_order
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
-from amvnet.progress import Say, say_nothing
+from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.frame import Frame
 from amvnet.sensors.intensity import IntensityMap, TrainedIntensity, intensity_map
@@ -120,7 +120,7 @@ class Normaliser:
         expected: what the weights expect. If it is None, scans are only turned as the sensor says,
             for people to look at.
         sensor: what is known about the scans' sensor; the rest is measured.
-        say: called with a line on what was assumed, once for each recording, and once for other
+        report: called with a line on what was assumed, once for each recording, and once for other
             sensors in it.
     """
 
@@ -128,11 +128,11 @@ class Normaliser:
         self,
         expected: Expectation | None = None,
         sensor: Sensor | None = None,
-        say: Say = say_nothing,
+        report: Reporter = report_nothing,
     ) -> None:
         self.expected = expected
         self.sensor = sensor or Sensor()
-        self._say = say
+        self._report = report
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
         self._said: set[str] = set()  # recordings whose line was already said
@@ -168,7 +168,7 @@ class Normaliser:
                 line += f"; {source} has scans of other sensors, so that each is measured alone"
             if not is_usual:
                 line += f"; another sensor or scale of intensity than {source} begins with"
-            self._say(line)
+            self._report(line)
         return scan
 
     def measure(self, source: str) -> Recording:
@@ -189,7 +189,7 @@ class Normaliser:
 
     def for_sensor(self, sensor: Sensor) -> Normaliser:
         """Return a normaliser for the same weights and the scans of a described sensor."""
-        return Normaliser(self.expected, sensor, self._say)
+        return Normaliser(self.expected, sensor, self._report)
 
     def target(self) -> dict[str, float]:
         """Return the sensor's measures for weights that are trained on the normalised scans.
@@ -231,7 +231,7 @@ class Normaliser:
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
             negative = _describe_negative(cloud)
             assumed = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
-            self._say(f"{cloud.name}: assumed {', '.join(filter(None, assumed))}")
+            self._report(f"{cloud.name}: assumed {', '.join(filter(None, assumed))}")
         return scan
 
 

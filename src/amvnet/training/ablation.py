@@ -91,7 +91,7 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
     """
     for gru, weighted in VARIANTS:
         name = _name(gru, weighted)
-        plan.say(f"{name}:")
+        plan.report(f"{name}:")
         recipe = _ablated(plan.recipe, gru, weighted)
         path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name), "rv")
 

@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from amvnet.progress import Say
+from amvnet.progress import Reporter
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import PART_OF, SETTINGS, stage_record, stage_settings, write_yaml
@@ -181,8 +181,8 @@ class EpochLines(Callback):
             long as one of this stage.
     """
 
-    def __init__(self, say: Say, name: str, later: int = 0) -> None:
-        self.say = say
+    def __init__(self, report: Reporter, name: str, later: int = 0) -> None:
+        self.report = report
         self.name = name
         self.later = later
         self._start = 0.0
@@ -205,7 +205,7 @@ class EpochLines(Callback):
         times = f"epoch in {took}, {left} left"
         if self.later:
             times += f", about {left + self.later * took} with the stages that follow"
-        self.say(f"{self.name} epoch {epoch}/{epochs}: {results}; {times}")
+        self.report(f"{self.name} epoch {epoch}/{epochs}: {results}; {times}")
 
 
 def _metrics(trainer: L.Trainer) -> dict[str, float]:

@@ -34,15 +34,15 @@ def check_data(plan: Plan) -> np.ndarray:
     def progress(done: int, total: int) -> None:
         if tenths.ends(done, total):
             size = plan.processes.size
-            plan.say(f"checked {min(done * size, total * size)} of {total * size} scans")
+            plan.report(f"checked {min(done * size, total * size)} of {total * size} scans")
 
     totals = np.zeros(plan.scans.dataset.taxonomy.size + 1, dtype=np.int64)
     for dataset, splits, counted_records in _datasets_of(plan):
-        report = check_scans(dataset, splits, progress, plan.processes)
-        _refuse(report)
-        for line in report.warnings():
-            plan.say(line)
-        totals += report.count_points(counted_records)
+        checked = check_scans(dataset, splits, progress, plan.processes)
+        _refuse(checked)
+        for line in checked.warnings():
+            plan.report(line)
+        totals += checked.count_points(counted_records)
     return totals[1:]
 
 
@@ -74,20 +74,20 @@ def _datasets_of(
         yield other.dataset, {"train": in_epoch if is_simulated else other.train}, in_epoch
 
 
-def _refuse(report: Report) -> None:
+def _refuse(checked: Report) -> None:
     """Raise InputError if a report has an error."""
-    for error in report.errors():
+    for error in checked.errors():
         raise InputError(error)
 
-    broken = report.broken
+    broken = checked.broken
     if broken:
-        total = sum(len(split.scans) + len(split.broken) for split in report.splits.values())
+        total = sum(len(split.scans) + len(split.broken) for split in checked.splits.values())
         others = list(broken)[1:NAMED]
         more = len(broken) - 1 - len(others)
         rest = f", also {', '.join(others)}" if others else ""
         rest += f" and {more} more" if more > 0 else ""
         raise InputError(
-            f"{report.spec}: expected scans that can be read, found {len(broken)} of "
+            f"{checked.spec}: expected scans that can be read, found {len(broken)} of "
             f"{counted(total, 'scan')} that cannot: {next(iter(broken.values()))}{rest}; correct "
             "them or leave them out (amvnet check lists all)"
         )

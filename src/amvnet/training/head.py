@@ -113,7 +113,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
     # Gather the uncertain points of all scans, with their scores and neighbours.
     gatherer = PointGatherer(plan, weights, intensity)
     train = gatherer.gather(
-        plan.scans.train, folder / "train", config.views, tau=config.tau, say=plan.say
+        plan.scans.train, folder / "train", config.views, tau=config.tau, report=plan.report
     )
     val = gatherer.gather(plan.scans.val, folder / "val") if plan.scans.val else None
 

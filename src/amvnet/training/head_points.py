@@ -24,7 +24,7 @@ from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
 from amvnet.models.views.points import PointBatch
-from amvnet.progress import Say, Tenths, say_nothing
+from amvnet.progress import Reporter, Tenths, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes, device_of
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity
@@ -158,7 +158,7 @@ class PointGatherer:
         folder: Path,
         views: int = 0,
         tau: float = 0.0,
-        say: Say = say_nothing,
+        report: Reporter = report_nothing,
     ) -> HeadPoints:
         """Gather the labelled uncertain points of some scans.
 
@@ -191,11 +191,11 @@ class PointGatherer:
         least = max(2, self.plan.processes.size)  # batch norm needs two, and each process one
 
         assertion = Disagreement(tau or self.weights.model.assertion.threshold)
-        points = self._gather(scans, keys, folder, assertion, say)
+        points = self._gather(scans, keys, folder, assertion, report)
         if len(points) < least:
-            say("head: the networks agree everywhere; it learns from points drawn from all")
+            report("head: the networks agree everywhere; it learns from points drawn from all")
             share = points.uncertain_share
-            points = self._gather(scans, keys, folder, _everywhere, say)
+            points = self._gather(scans, keys, folder, _everywhere, report)
             points.uncertain_share = share
 
         if len(points) < least:
@@ -228,7 +228,12 @@ class PointGatherer:
         return f_valid.to(self._device), g_valid.to(self._device)
 
     def _gather(
-        self, scans: ScanSet, keys: Sequence[Key], folder: Path, assertion: Assertion, say: Say
+        self,
+        scans: ScanSet,
+        keys: Sequence[Key],
+        folder: Path,
+        assertion: Assertion,
+        report: Reporter,
     ) -> HeadPoints:
         """Gather the points that an assertion finds uncertain, of some views of scans."""
         processes = self.plan.processes
@@ -256,7 +261,7 @@ class PointGatherer:
                 labels_of_scans.append(labels)
                 matrices += scan_matrices
                 if tenths.ends(number, len(share)):
-                    say(f"head: scored {number * len(keys) // len(share)} of {len(keys)} scans")
+                    report(f"head: scored {number * len(keys) // len(share)} of {len(keys)} scans")
 
         # The points of all scans, in their order; the processes take the scans in turns.
         labels_by_rank = processes.gather(labels_of_scans)

@@ -104,7 +104,7 @@ class NetworkStage(Stage):
                 "(--training.augment.*), or label more points"
             )
         if empty:
-            self.say(
+            self.report(
                 f"{self.name}: {empty} of {batches} batches had no labelled point to learn from"
             )
 
@@ -244,7 +244,7 @@ def make_stage(
         "taxonomy": plan.scans.dataset.taxonomy,
         "weights": weights,
         "processes": plan.processes,
-        "say": plan.say,
+        "report": plan.report,
     }
     if name == "rv":
         return RangeStage(model.range_view, model.range_net, **shared)

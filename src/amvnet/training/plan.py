@@ -20,7 +20,7 @@ from amvnet.errors import InputError
 from amvnet.inference.reading import normalised_for
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
-from amvnet.progress import Say, say_nothing
+from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.weights.file import Weights, load
 
@@ -35,7 +35,7 @@ class Plan:
             kept as the best.
         out: the folder of the run.
         resume: continue an earlier run in the same folder.
-        say: prints a line about what happens.
+        report: a function that prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
         processes: those that share the run; all must see its folder.
         scores: two other models' scores of the scans, to train the head on instead of on the
@@ -54,7 +54,7 @@ class Plan:
     scans: TrainingScans
     out: Path
     resume: bool = False
-    say: Say = say_nothing
+    report: Reporter = report_nothing
     bars: bool = False
     processes: Processes = ALONE
     scores: ScorePair | None = None
@@ -96,7 +96,7 @@ class Plan:
         choose: Callable[[Dataset], TrainingScans],
         init: Weights | None = None,
         *,
-        say: Say = say_nothing,
+        report: Reporter = report_nothing,
         **settings: Any,
     ) -> Plan:
         """Open the datasets of a training run, and return its plan.
@@ -115,9 +115,9 @@ class Plan:
         """
         recipe = sized_by_init(recipe, init)
         dataset, others = open_parts(data, recipe, out, init)
-        recipe = without_weight_averaging(recipe, init, dataset.taxonomy, say)
+        recipe = without_weight_averaging(recipe, init, dataset.taxonomy, report)
         scans = join(choose(dataset), others, recipe.training.others)
-        return cls(recipe, scans, out, say=say, **settings)
+        return cls(recipe, scans, out, report=report, **settings)
 
     def build(self, weights: Weights) -> AMVNet:
         """Return the model of some weights; parts that they lack are initialised at random.
@@ -154,7 +154,7 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
 
 
 def without_weight_averaging(
-    recipe: Recipe, init: Weights | None, classes: Taxonomy, say: Say
+    recipe: Recipe, init: Weights | None, classes: Taxonomy, report: Reporter
 ) -> Recipe:
     """Return a recipe that averages no weights with initial weights for other classes.
 
@@ -167,7 +167,7 @@ def without_weight_averaging(
     for name in ("rv", "bev"):
         config = getattr(recipe.training, name)
         if config.initial:
-            say(f"{name}: no mean with the initial weights, which have other classes")
+            report(f"{name}: no mean with the initial weights, which have other classes")
             networks[name] = dataclasses.replace(config, initial=0.0)
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 

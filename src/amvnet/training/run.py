@@ -82,7 +82,7 @@ def _draw_curves(plan: Plan) -> None:
             stages[name] = read_curves(plan.out / name, taxonomy, epochs)
     if stages:
         path = draw_curves(stages, plan.out / CURVES)
-        plan.say(f"loss, mIoU by epoch and IoU by class: {path}")
+        plan.report(f"loss, mIoU by epoch and IoU by class: {path}")
 
 
 def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
@@ -122,7 +122,7 @@ def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> 
             continue
         # A new kind of head can be trained on the networks of any weights.
         if name == "head" and name in trained and not init.fits(part, plan.recipe.model):
-            plan.say("head: new, as that of the initial weights has other sizes")
+            plan.report("head: new, as that of the initial weights has other sizes")
             continue
         begin = _deepened(plan, init, part) if name in trained else init
         if init.taxonomy.classes == weights.taxonomy.classes:
@@ -140,7 +140,7 @@ def _deepened(plan: Plan, init: Weights, part: str) -> Weights:
     deeper = deepened(init, part, plan.recipe.model, plan.recipe.training.seed)
     if deeper is None:
         return init
-    plan.say(f"{part}: the initial weights with new residual blocks, which begin as skips")
+    plan.report(f"{part}: the initial weights with new residual blocks, which begin as skips")
     return deeper
 
 
@@ -166,7 +166,7 @@ def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
     taxonomy = plan.scans.dataset.taxonomy
     weights, new = init.for_classes(taxonomy, plan.recipe.training.seed)
     of_part = [name for name in new if name.startswith(f"{part}.")]
-    plan.say(
+    plan.report(
         f"{part}: for the classes of {taxonomy.name}, all layers of the initial weights "
         f"({init.taxonomy.name}) but {', '.join(of_part)}, which are new"
     )

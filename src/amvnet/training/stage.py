@@ -29,7 +29,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
 from amvnet.models.views.points import PointBatch
-from amvnet.progress import Say, say_nothing
+from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes, device_of, environment
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.intensity import TrainedIntensity
@@ -63,13 +63,13 @@ class Stage(L.LightningModule):
         config: NetworkTraining | HeadTraining,
         taxonomy: Taxonomy,
         processes: Processes = ALONE,
-        say: Say = say_nothing,
+        report: Reporter = report_nothing,
     ) -> None:
         super().__init__()
         self.config = config
         self.taxonomy = taxonomy
         self.processes = processes
-        self.say = say
+        self.report = report
         self.matrix = self.empty_matrix()
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
@@ -231,7 +231,7 @@ def _callbacks(stage: Stage, plan: Plan, keep_weights: KeepWeights) -> list[Call
     Weights are written before the checkpoint, which never claims more than has been written.
     """
     has_bar = plan.bars and plan.processes.first
-    lines = EpochLines(plan.say, stage.name, _epochs_after(stage, plan))
+    lines = EpochLines(plan.report, stage.name, _epochs_after(stage, plan))
     callbacks: list[Callback] = [
         keep_weights,
         KeepSignals(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amvnet.cli.console import on_terminal, say, say_lines
+from amvnet.cli.console import on_terminal, report, report_lines
 from amvnet.cli.options import TrainingChoice, describe_records, join_processes
 from amvnet.config.schema import Recipe
 
@@ -42,13 +42,13 @@ def ablate(
         [data],
         out,
         choose=choice.scans,
-        say=say,
+        report=report,
         resume=True,
         bars=on_terminal(),
         processes=processes,
     )
     scans = plan.scans
-    say(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
+    report(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
 
     table = {out / f"{TABLE}.csv": charts.TABLE}
     check_outputs(table, [data], overwrite=is_begun(out))
@@ -56,4 +56,4 @@ def ablate(
     rows = list(ablate_recipe(plan, device))
     if processes.first:
         files = charts.write_ablation(rows, out / TABLE)
-        say_lines(files[-1].read_text().rstrip())
+        report_lines(files[-1].read_text().rstrip())

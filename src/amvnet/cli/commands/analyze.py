@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelledChoice, load_segmenter
 from amvnet.config.bounds import Range, Share
 from amvnet.errors import InputError
@@ -76,7 +76,7 @@ def analyze(
     if recipe is not None:
         names = train_sequences or dataset.sequences("train")
         scans = TrainingScans(dataset, dataset.labelled(dataset.records(names)), records)
-        plan = Plan(load_recipe(recipe), scans, out, resume=True, say=say)
+        plan = Plan(load_recipe(recipe), scans, out, resume=True, report=report)
 
     make_folder(out)
     with progress("scoring") as step:
@@ -96,4 +96,4 @@ def analyze(
                 study = replace(plan, out=out / name)
                 rows = list(sweep_heads(study, models, loaded, segmenter.device))
                 written += charts.write_sweep(rows, parameter, used, data, out / name)
-    say(f"{counted(len(written), 'file')} in {out}")
+    report(f"{counted(len(written), 'file')} in {out}")

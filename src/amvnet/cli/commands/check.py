@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from amvnet.cli.console import progress, say, show
+from amvnet.cli.console import progress, report, show
 from amvnet.cli.options import TrainingChoice
 from amvnet.errors import InputError, SomeBroken
 from amvnet.progress import counted
@@ -22,19 +22,19 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     dataset = open_dataset(data)
     splits = dict(choice.splits(dataset))
     with progress("checking") as step:
-        report = check_scans(dataset, splits, step)
+        checked = check_scans(dataset, splits, step)
 
-    show(contents_table(report))
-    if report.unknown:
-        show(unknown_table(report))
-    for line in report.warnings():
-        say(line)
+    show(contents_table(checked))
+    if checked.unknown:
+        show(unknown_table(checked))
+    for line in checked.warnings():
+        report(line)
 
-    broken = report.broken
-    errors = list(report.errors())
+    broken = checked.broken
+    errors = list(checked.errors())
     if errors:
         for message in broken.values():
-            say(f"broken: {message}")
+            report(f"broken: {message}")
         raise InputError(errors[0])
     if broken:
         raise SomeBroken(
@@ -42,5 +42,5 @@ def check(data: str, /, choice: TrainingChoice) -> None:
             "leave them out",
             list(broken.values()),
         )
-    scans = sum(len(split.scans) for split in report.splits.values())
-    say(f"{counted(scans, 'scan')} can be trained on or scored")
+    scans = sum(len(split.scans) for split in checked.splits.values())
+    report(f"{counted(scans, 'scan')} can be trained on or scored")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from amvnet.cli.commands.evaluate import show_evaluation
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.cli.options import WEIGHTS
 
 SEED = 20_201_209  # far from the seeds of the streets that the built-in weights were trained on
@@ -57,4 +57,4 @@ def demo(
         shown = show_scans(scans, taxonomy, segmenter, progress=step)
         evaluation = write_page(page, shown, taxonomy, "Simulated streets")
     show_evaluation(evaluation, f"simulated streets, seed {seed}", metrics_path)
-    say(f"labelled scans in {data}, figures in {metrics_path}; open {page} in a browser")
+    report(f"labelled scans in {data}, figures in {metrics_path}; open {page} in a browser")

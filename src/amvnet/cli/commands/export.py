@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 
 
 def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = False) -> None:
@@ -24,13 +24,13 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
     check_outputs(possible_files(out), [weights, int8], overwrite)
     with progress("exporting") as step:
         graphs = export_weights(weights, out, step, int8)
-    say(f"{len(graphs)} graphs and amvnet.json in {out}")
+    report(f"{len(graphs)} graphs and amvnet.json in {out}")
     differences = [graph["difference"] for graph in graphs.values() if "difference" in graph]
     if differences:
-        say(f"those in float32 differ from torch by at most {max(differences):.1e}")
+        report(f"those in float32 differ from torch by at most {max(differences):.1e}")
     for name, graph in graphs.items():
         if "agreement" in graph:
-            say(
+            report(
                 f"{name} is in int8 now; on scans it was not calibrated with, "
                 f"{graph['agreement']:.1%} of its labels are as before"
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice
 from amvnet.config.bounds import Count
 from amvnet.errors import import_optional
@@ -55,6 +55,6 @@ def fleet(
             on_ray.Cluster(address, workers, compute, batch),
             resume=resume,
             progress=step,
-            say=say,
+            report=report,
         )
-    say(f"{counted(written, 'label file')} in {out}; the table of results is in {out}/results")
+    report(f"{counted(written, 'label file')} in {out}; the table of results is in {out}/results")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.cli.options import ScanChoice, ScoresChoice
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
@@ -66,6 +66,6 @@ def fuse(
     for side, share in fused.silent.items():
         if share:
             folder = models.scores_a if side == "a" else models.scores_b
-            say(f"{folder} ({side}): no opinion of {share:.1%} of the points")
+            report(f"{folder} ({side}): no opinion of {share:.1%} of the points")
     files = counted(fused.files, "label file")
-    say(f"{files} in {out}; the two models disagree on {fused.uncertain:.1%} of the points")
+    report(f"{files} in {out}; the two models disagree on {fused.uncertain:.1%} of the points")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from amvnet.cli.console import say_lines, show
+from amvnet.cli.console import report_lines, show
 
 
 def info(weights: str | None = None, /) -> None:
@@ -19,4 +19,4 @@ def info(weights: str | None = None, /) -> None:
         show(installation_table())
         return
     license_id = OURS if weights in built_in() else None
-    say_lines(model_card(load(weights), weights, license_id).rstrip())
+    report_lines(model_card(load(weights), weights, license_id).rstrip())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Count
 from amvnet.errors import InputError
@@ -62,6 +62,6 @@ def predict(
             resume=resume,
             also_read=(*inputs, weights, labels.classes, known.sensor),
             progress=step,
-            say=say,
+            report=report,
         )
-    say(f"{counted(written, 'label file')} in {out}")
+    report(f"{counted(written, 'label file')} in {out}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelledChoice, load_segmenter
 from amvnet.models.methods import Compute
 from amvnet.progress import counted
@@ -47,4 +47,4 @@ def rank(
     with progress("scoring") as step:
         clusters = rank_records(dataset, records, segmenter, step)
     write_clusters(clusters, records, dataset.taxonomy, out)
-    say(f"{counted(len(clusters), 'cluster')} of {counted(len(records), 'scan')} in {out}")
+    report(f"{counted(len(clusters), 'cluster')} of {counted(len(records), 'scan')} in {out}")

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.config.bounds import Count, Range
 from amvnet.progress import counted
 
@@ -47,4 +47,4 @@ def simulate(
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=step,
         )
-    say(f"{counted(sequences * scans, 'scan')} in {out}")
+    report(f"{counted(sequences * scans, 'scan')} in {out}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.errors import InputError
 from amvnet.progress import counted
 
@@ -47,9 +47,9 @@ def submit(
         count = pack.write(rules, predictions, out, use_external=use_external, progress=step)
     packed = counted(count, "prediction")
     fit = "keeps" if count == 1 else "keep"
-    say(f"{out}: {packed} {fit} to the rules of {rules.taxonomy.name}")
+    report(f"{out}: {packed} {fit} to the rules of {rules.taxonomy.name}")
     if rules.official is not None and count < rules.official:
-        say(
+        report(
             f"note: the benchmark has {rules.official} scans in this split; "
             "its server refuses an archive with fewer"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from amvnet.cli.console import on_terminal, say
+from amvnet.cli.console import on_terminal, report
 from amvnet.cli.options import ScoresChoice, TrainingChoice, describe_records, join_processes
 from amvnet.config.schema import Recipe
 
@@ -57,7 +57,7 @@ def train(
         out,
         choose=lambda dataset: choice.scans(dataset, with_val),
         init=weights,
-        say=say,
+        report=report,
         resume=resume,
         bars=on_terminal(),
         processes=processes,
@@ -65,11 +65,13 @@ def train(
         also_read=(*data, init),
     )
     scans = plan.scans
-    say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
+    report(
+        f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}"
+    )
 
     path = train_stages(plan, stage, weights)
     line = f"weights in {path}"
     parts = load(path).parts
     if stage != "head" and set(BOTH_NETWORKS) <= set(parts) and "point_head" not in parts:
         line += "; they have no point head: the same command with --stage head trains it"
-    say(line)
+    report(line)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from amvnet.cli.console import progress, say
+from amvnet.cli.console import progress, report
 from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute, widest_method
@@ -69,12 +69,12 @@ def view(
 
     segmenter = None
     classes = None if taxonomy is None else TAXONOMIES[taxonomy]
-    normaliser = Normaliser(None, sensor, say)
+    normaliser = Normaliser(None, sensor, report)
     if weights is not None:
         loaded = load(weights)
         segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
         classes = segmenter.taxonomy
-        normaliser = normaliser_for(loaded, sensor, say)
+        normaliser = normaliser_for(loaded, sensor, report)
 
     listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser)
     if labels is not None:
@@ -84,7 +84,7 @@ def view(
     with progress("looking") as step:
         shown = show_scans(chosen, classes, segmenter, labels, progress=step)
         write_page(page, shown, classes, _title(inputs, weights))
-    say(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")
+    report(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")
     if html is None:
         open_page(page)
 
