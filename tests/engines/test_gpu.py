@@ -26,7 +26,7 @@ from amvnet.engines.precision import InPrecision, choose_device, choose_precisio
 from amvnet.engines.streams import TwoStreams
 from amvnet.inference.journal import Entry, Journal
 from amvnet.inference.listing import ScanOptions
-from amvnet.inference.pipeline import AHEAD, OutputOptions, Pipeline
+from amvnet.inference.pipeline import READ_AHEAD, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import LateFusion
@@ -542,7 +542,7 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
     done = [result.scan for result in results if isinstance(result, Entry)]
     assert done == [f"{seed}.npz" for seed in range(23)]
     assert [batch.count for batch in engine.batches] == [4, 4, 4, 4, 4, 3]
-    assert counter.most <= 2 * 4 + AHEAD + 2
+    assert counter.most <= 2 * 4 + READ_AHEAD + 2
     assert not counter.in_memory
 
 

@@ -26,7 +26,7 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan, list_inputs
-from amvnet.inference.pipeline import AHEAD, OutputOptions, Pipeline
+from amvnet.inference.pipeline import READ_AHEAD, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.segmenter import Segmentation
 from amvnet.scan import Scan
@@ -482,7 +482,7 @@ def test_few_scans_are_in_memory_however_many_there_are(
     outcomes = pipeline.stream(scans, pipeline.write_or_explain)
     done = [entry.scan for entry in outcomes if isinstance(entry, Entry)]
     assert done == [f"{index}.npz" for index in range(30)]
-    assert counter.most <= 2 * AHEAD + 2 * at_once
+    assert counter.most <= 2 * READ_AHEAD + 2 * at_once
     assert not counter.in_memory
 
 

@@ -19,7 +19,7 @@ from amvnet.errors import InputError
 from amvnet.evaluation.analysis import analyze
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.listing import list_inputs
-from amvnet.inference.scan_stream import AHEAD, stream_scans
+from amvnet.inference.scan_stream import READ_AHEAD, stream_scans
 from amvnet.inference.segmenter import Segmenter
 from amvnet.ranking.label_errors import rank
 from amvnet.runtime.memory import available_memory
@@ -56,7 +56,7 @@ def test_few_scans_are_in_memory() -> None:
 
     results = stream_scans(range(100), lambda n: loaded.append(n), lambda n, scan: n, at_once=2)
     for done in results:
-        assert len(loaded) <= done + 1 + AHEAD + 2 * 2
+        assert len(loaded) <= done + 1 + READ_AHEAD + 2 * 2
 
 
 def test_an_error_comes_in_its_turn() -> None:

@@ -34,7 +34,7 @@ from amvnet.inference.pipeline import Outcome, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.request import LabellingRequest
-from amvnet.inference.scan_stream import AHEAD
+from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation, uncertain_share
 from amvnet.models.methods import Compute
 from amvnet.progress import Reporter, report_nothing
@@ -137,7 +137,7 @@ class LabelScans:
                 at_once=self._segmenter.at_once,
             )
             row_of = {scan.name: row for scan, row in zip(scans, drive, strict=True)}
-            rows = list(pipeline.stream(scans, partial(self._write, pipeline, row_of), AHEAD))
+            rows = list(pipeline.stream(scans, partial(self._write, pipeline, row_of), READ_AHEAD))
 
         seconds = (time.perf_counter() - start) / len(drive)
         return [row | {"seconds": seconds} for row in rows]

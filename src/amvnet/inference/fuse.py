@@ -1,4 +1,4 @@
-"""The late fusion alone, of any two models' scores of points or in files (paper: 3.2 and 3.3)."""
+"""The late fusion alone: fuse any two models' scores (sections 3.2 and 3.3 of the paper)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults
 from amvnet.inference.reading import checked_scan, normaliser_for
-from amvnet.inference.scores import SURE, ScorePair, as_probabilities, have_opinion
+from amvnet.inference.scores import LEAST_PROBABILITY, ScorePair, as_probabilities, have_opinion
 from amvnet.inference.segmentation import Segmentation, fetch, unpack
 from amvnet.models.amvnet import LateFusion, Scores
 from amvnet.models.assertion import Disagreement
@@ -56,9 +56,12 @@ class Fusion:
         self.model = LateFusion(assertion, point_head)
 
     def __call__(self, points: AnyArray | Scan, f: AnyArray, g: AnyArray) -> Segmentation:
-        """Fuse (N, K) class probabilities of one scan's N points.
+        """Fuse two models' scores of one scan's N points.
 
-        Rows of zeros say that a model has no opinion, and count as 1/K.
+        Args:
+            points: as `Segmenter.__call__` takes them, but no path.
+            f, g: (N, K) class probabilities of each model. A row of zeros says that the model has
+                no opinion of this point, and counts as 1/K.
 
         Raises:
             InputError: if the shapes do not fit, or the scores are not probabilities.
@@ -74,8 +77,8 @@ class Fusion:
         with torch.inference_mode():
             scores = self.model.fuse(
                 PointBatch.of([scan]),
-                torch.from_numpy(f_valid).clamp_min(SURE),
-                torch.from_numpy(g_valid).clamp_min(SURE),
+                torch.from_numpy(f_valid).clamp_min(LEAST_PROBABILITY),
+                torch.from_numpy(g_valid).clamp_min(LEAST_PROBABILITY),
             )
 
         labels, fused = fetch(Scores(scores.merged, scores.uncertain, rv=None, bev=None))
@@ -106,18 +109,21 @@ def fuse(
 
     Args:
         points: (N, 4) x, y, z in metres and intensity in [0, 1].
-        f: (N, K) class probabilities of one model; a row of zeros says that it has no opinion of
+        f: (N, K) class probabilities of one model. A row of zeros says that it has no opinion of
             this point, and counts as 1/K.
         g: (N, K) class probabilities of the other model.
-        head: a trained point head, or weights that hold one; None gives the ensemble.
-        tau: points whose scores have a cosine similarity of at most this are uncertain; by default
-            the threshold that the weights were trained with, or the paper's without weights.
+        head: a trained point head, or weights that hold one. Without a head, the labels are the
+            ensemble's.
+        tau: the threshold of the assertion, in [0, 1]: points whose scores have a cosine similarity
+            of at most `tau` are uncertain. By default the threshold that the weights were trained
+            with; without weights, the threshold of the paper.
 
     Returns:
         (N,) uint8 train ids 1..K; 0 for points that are not finite.
 
     Raises:
-        InputError: if the shapes do not fit, or the scores are not probabilities.
+        InputError: if the shapes do not fit, the scores are not probabilities, the weights hold no
+            head, or `tau` is out of range.
     """
     return Fusion(head, tau)(points, f, g).labels
 
@@ -128,7 +134,8 @@ class Fused(NamedTuple):
     Attributes:
         files: the number of label files.
         uncertain: the share of the points on which the two models disagree, in [0, 1].
-        silent: by side, the share of the points about which its model has no opinion, in [0, 1].
+        silent: by side ("a" or "b"), the share of the points of which its model has no opinion, in
+            [0, 1].
     """
 
     files: int
@@ -147,21 +154,26 @@ def fuse_files(
     taxonomy: Taxonomy | None = None,
     progress: Progress = no_progress,
 ) -> Fused:
-    """Fuse two models' scores of scans, and write the labels as `predict` does.
+    """Fuse two models' scores of scans, and write the labels as `predict` writes them.
 
     Args:
-        head: weights with a point head; None gives the ensemble.
-        tau: threshold of the cosine similarity; by default the head's, or else the paper's.
+        inputs: the scans, as `list_inputs` takes them.
+        pair: the scores of both models.
+        output: which files are written, and where.
+        options: which scans of the inputs to use.
+        head: weights with a point head. Without them, the labels are the ensemble's.
+        tau: the threshold of the assertion, in [0, 1]; by default the threshold of the head's
+            weights, or of the paper without a head.
         taxonomy: the classes if there is no head; by default the classes of the inputs.
 
     Raises:
         InputError: before anything is written, if scores of a scan are missing or a file of the
-            user would be replaced; at the end, if all are broken.
+            user would be replaced; at the end, if the scores of all scans are broken.
         SomeBroken: at the end, if the scores of some scans are broken.
     """
     if head is None:
         normaliser = Normaliser(Expectation(ModelConfig().range_view, Sensor()))
-    else:  # scan files are normalised as for the networks that the head was trained with
+    else:  # the head takes scans like the networks that it was trained with
         normaliser = normaliser_for(head)
         taxonomy = head.taxonomy
 
@@ -172,7 +184,7 @@ def fuse_files(
     output = replace(output, also_read=[*output.also_read, *scores])
 
     fusion = Fusion(head, tau)
-    silent: Counter[str] = Counter()  # by side, points without an opinion
+    silent: Counter[str] = Counter()  # by side, the points of which the model has no opinion
 
     def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
         results = []

@@ -1,4 +1,4 @@
-"""A record in the output folder of the scans that are done, so that a run can be resumed."""
+"""A journal in the output folder lists the scans that are done, so that a run can be resumed."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from amvnet.errors import InputError
 from amvnet.files import PARTS, atomic_write, make_folder
 from amvnet.progress import counted
 
-JOURNAL = ".amvnet-journal.jsonl"  # of a run that has ended
-UNFINISHED = ".unfinished.jsonl"  # until the run ends
+JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
+UNFINISHED = ".unfinished.jsonl"  # the name of the journal during the run
 
 
 class Entry(NamedTuple):
     """A scan that is done.
 
     Attributes:
-        scan: its name.
-        origin: a digest of the size and time of its file; of a normalised scan, also of those of
-            the first files of its recording, on which the sensor is measured.
-        sensor: a title of what recorded it.
-        points: how many of its points are valid.
-        uncertain: how many are uncertain.
+        scan: the name of the scan.
+        origin: a digest of the size and time of its file, and of the first files of its recording,
+            on which the sensor is measured.
+        sensor: the name of the recording, whose scans have one sensor.
+        points: the number of valid points.
+        uncertain: the number of uncertain points.
     """
 
     scan: str
@@ -38,14 +38,15 @@ class Entry(NamedTuple):
 
 
 class Journal:
-    """A file of the scans that are done, each added after its output.
+    """A file that lists the scans that are done. A scan is added after its output.
 
     If the process is killed, at most one line is lost. After a power cut, the last lines may be
-    missing or torn: these scans are done again. The output of a scan in the journal is on the
+    missing or torn: these scans are done again. If a scan is in the journal, its output is on the
     disk, because `atomic_write` puts it there first.
 
     Args:
-        settings: what the output depends on, as JSON types.
+        folder: the output folder; it is made if it is missing.
+        settings: all that the output depends on, in JSON types.
         done: entries of an earlier run that stay valid, from `read_journals`.
 
     Raises:
@@ -66,17 +67,17 @@ class Journal:
             with suppress(OSError):  # some network file systems have no locks
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             (folder / JOURNAL).unlink(missing_ok=True)
-            for path in folder.rglob(PARTS):  # files that earlier runs did not finish
+            for path in folder.rglob(PARTS):  # earlier runs did not finish these files
                 if path.is_file():
                     path.unlink()
 
     def add(self, entry: Entry) -> None:
-        """Write down that a scan is done."""
+        """Add the entry of a scan that is done."""
         self._file.write(_to_line(entry))
         self._file.flush()
 
     def close(self) -> dict[str, Entry]:
-        """End the run; return all entries by the name of the scan."""
+        """End the run; return all entries, by the name of the scan."""
         self._file.close()
         _, entries = _read(self.path)
         if entries:
@@ -87,7 +88,7 @@ class Journal:
 
 
 def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]:
-    """Return what an earlier run into a folder has done, by the name of the scan.
+    """Return the entries of an earlier run into a folder, by the name of the scan.
 
     Raises:
         InputError: if that run had other settings.
@@ -105,11 +106,12 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
 
 
 def describe_other_run(folder: Path, settings: Mapping[str, Any], scans: Set[str]) -> str:
-    """Say what an earlier run left in a folder that a run is about to write into; empty if nothing.
+    """Describe the labels that stay in a folder from an earlier run; return "" if there are none.
 
     Args:
-        settings: of the run, as for `Journal`.
-        scans: the names of its scans, whose files it replaces.
+        folder: the folder that the new run is about to write into.
+        settings: the settings of the new run, as `Journal` takes them.
+        scans: the names of the new run's scans, whose files it replaces.
     """
     others: set[str] = set()
     changed: set[str] = set()
@@ -133,13 +135,16 @@ def check_settings(
     """Raise InputError if the earlier run in a place had other settings.
 
     Args:
-        advice: what to do instead of resuming it with the same settings.
+        place: the beginning of the message.
+        settings: the settings of this run.
+        earlier: the settings of the earlier run.
+        advice: the alternative to the same settings, for the message.
     """
     changed = [key for key in settings if settings[key] != earlier.get(key)]
     if changed:
         raise InputError(
             f"{place}: expected the settings of the earlier run, found another "
-            f"{', '.join(changed)}; resume it with the same, or {advice}"
+            f"{', '.join(changed)}; resume it with the same settings, or {advice}"
         )
 
 
@@ -179,7 +184,7 @@ def _to_line(value: Any) -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[Entry]]:
-    """Return the settings, empty if they cannot be read, and the entries in a journal."""
+    """Return the settings and the entries of a journal; settings that cannot be read are empty."""
     lines = path.read_text(errors="replace").splitlines(keepends=True)
     settings = _from_line(lines[0]) if lines else None
     if not isinstance(settings, dict):
@@ -194,7 +199,7 @@ def _read(path: Path) -> tuple[dict[str, Any], list[Entry]]:
 
 
 def _from_line(line: str) -> Any:
-    """Return the value in a line; None if it was not written to its end, or is corrupt."""
+    """Return the value of a line; None if the line is incomplete or corrupt."""
     if not line.endswith("\n"):
         return None
     try:

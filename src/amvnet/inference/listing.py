@@ -1,4 +1,4 @@
-"""The scans of a user's inputs: datasets, scan files, bags, and folders of these."""
+"""List the scans of a user's inputs: datasets, scan files, bags, and folders of these."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class ScanOptions:
     """Which scans of the inputs to use.
 
     Attributes:
-        sequences: of datasets, these sequences or scenes; by default the sequences of `split`.
-        split: of datasets, the official split.
-        topic: of bags; by default the only topic with scans.
-        layout: of rows of numbers without names, what they hold.
+        sequences: the sequences or scenes to use of datasets; by default the sequences of `split`.
+        split: the official split to use of datasets.
+        topic: the topic to read in bags; by default the only one with scans.
+        layout: the names of the columns in files that do not name them.
     """
 
     sequences: Sequence[str] | None = None
@@ -50,9 +50,8 @@ class LoadedScan:
     """A scan in memory.
 
     Attributes:
-        scan: as the segmenter takes it.
-        file_xyz: (N, 3) the coordinates as they are in the scan's file; None for a scan of a
-            dataset.
+        scan: the scan, ready for the segmenter.
+        file_xyz: (N, 3) the unchanged coordinates of the scan's file; None for a scan of a dataset.
     """
 
     scan: Scan
@@ -60,15 +59,15 @@ class LoadedScan:
 
 
 class DatasetScan:
-    """A scan of a dataset, not read yet; its labels are in the dataset's format and classes.
+    """A scan of a dataset that is not read yet; its labels have the dataset's format and classes.
 
     Attributes:
         written: the classes of the labels that are written; by default the classes of the dataset.
-        name: for messages, unique among the scans of one input.
+        name: the name in messages, unique among the scans of one input.
         title: a short name for people who look at the scan.
-        source: the recording that it is from: a sequence, a bag or a folder.
-        path: the file that the scan is read from.
-        scores_path: of the `.npz` of its scores, relative to a folder of predictions.
+        source: the recording of the scan: a sequence, a bag or a folder.
+        path: the file that holds the scan.
+        scores_path: the path of the `.npz` of its scores, relative to a folder of predictions.
     """
 
     def __init__(self, dataset: Dataset, record: ScanRecord) -> None:
@@ -83,23 +82,31 @@ class DatasetScan:
 
     @property
     def files(self) -> list[Path]:
-        """The files of its points and its labels."""
+        """The files of the scan's points and labels."""
         return self.dataset.files_of(self.record)
 
     def labels_path(self, kind: str) -> Path:
-        """Return the path of the file of its labels, relative to a folder of predictions."""
+        """Return the path of the scan's label file, relative to a folder of predictions."""
         return Path(self.record.prediction)
 
     def load(self, labels: bool = False) -> LoadedScan:
-        """Read the scan, with the ground truth if `labels` and there is any.
+        """Read the scan.
+
+        Args:
+            labels: also read the ground truth, if there is any.
 
         Raises:
-            InputError: if it cannot be read.
+            InputError: if the scan cannot be read.
         """
         return LoadedScan(self.dataset.read(self.record, labels=labels))
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-        """Read the (N,) train ids of the points; raise InputError if they cannot be read."""
+        """Read the (N,) train ids of the points; raise InputError if they cannot be read.
+
+        Args:
+            path: a folder of predictions.
+            count, taxonomy: not used; the dataset knows them.
+        """
         return self.dataset.read_prediction(self.record, path)
 
     def write_labels(
@@ -128,16 +135,16 @@ class FileReader:
     read twice.
 
     Args:
-        normaliser: normalises the scans; None reads them as they are.
+        normaliser: normalises the scans; without it, they stay unchanged.
     """
 
     def __init__(self, normaliser: Normaliser | None) -> None:
         self.normaliser = normaliser
         self.is_normalising = normaliser is not None and normaliser.expected is not None
-        self._clouds: dict[tuple[str, str], Cloud] = {}  # by source and name, of one source
+        self._clouds: dict[tuple[str, str], Cloud] = {}  # by source and name; all of one source
 
     def expect(self, scan: NamedScan) -> None:
-        """Announce a scan; call this for the scans of a source in their order."""
+        """Announce a scan; announce the scans of a source in their order."""
         if self.normaliser is not None:
             self.normaliser.expect(scan.source, partial(self._read_and_keep, scan))
 
@@ -164,7 +171,7 @@ class FileReader:
 
 
 class FileScan:
-    """A scan in a file or a bag, not read yet; it has the attributes of `DatasetScan`."""
+    """A scan in a file or a bag that is not read yet; `DatasetScan` documents the attributes."""
 
     def __init__(self, scan: NamedScan, reader: FileReader) -> None:
         self.scan = scan
@@ -177,11 +184,15 @@ class FileScan:
 
     @property
     def files(self) -> list[Path]:
-        """The file that it is in; those of a bag that is a folder."""
+        """The file that holds the scan, or all files of a bag that is a folder."""
         return [*self.path.iterdir()] if self.path.is_dir() else [self.path]
 
     def labels_path(self, kind: str) -> Path:
-        """Return the path of its labels in a format, relative to a folder of predictions."""
+        """Return the path of the scan's label file, relative to a folder of predictions.
+
+        Args:
+            kind: the format, one of `writers.KINDS`.
+        """
         return Path(f"{self.name}.{kind}")
 
     def load(self, labels: bool = False) -> LoadedScan:
@@ -193,7 +204,7 @@ class FileScan:
 
         Args:
             path: a label file, or a folder of predictions.
-            count: N.
+            count: N, the number of points.
             taxonomy: turns raw ids into train ids.
         """
         if path.is_dir():
@@ -236,9 +247,11 @@ def list_inputs(
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, a folder of these, or
             a pattern as `find_scans` takes it.
-        taxonomy: the classes, of weights or as the user names them. If None, they are those of the
-            datasets; scan files have nuScenes' if they end in `.pcd.bin`, else SemanticKITTI's.
-        normaliser: normalises scan files to weights; None reads them as they are.
+        options: which scans of the inputs to use.
+        taxonomy: the classes of the weights, or the classes that the user names. By default, a
+            dataset has its own classes, a scan file whose name ends in `.pcd.bin` has the classes
+            of nuScenes, and any other scan file has the classes of SemanticKITTI.
+        normaliser: normalises scan files to weights; without it, they stay unchanged.
 
     Returns:
         The scans, and the classes of their labels.
@@ -276,7 +289,7 @@ def list_inputs(
 
 
 class Scans(Sequence[Scan]):
-    """The scans of a file, a bag, a folder or a dataset, read on demand."""
+    """The scans of a file, a bag, a folder or a dataset; each is read when it is asked for."""
 
     def __init__(self, path: Path | str, scans: Sequence[InputScan]) -> None:
         self.path = path
@@ -303,12 +316,13 @@ class Scans(Sequence[Scan]):
 def read(path: Path | str, topic: str | None = None) -> Scan:
     """Read the only scan of a file.
 
-    Its points are as they are in the file, with intensities scaled to [0, 1]. To segment it as
-    `amvnet predict` does, give the path to a `Segmenter`, which normalises the scan to its weights.
+    The points have the coordinates of the file, and intensities scaled to [0, 1]. To segment the
+    scan as `amvnet predict` does, give the path to a `Segmenter`, which also normalises the scan to
+    its weights.
 
     Args:
         path: a scan file of any supported format, or a bag.
-        topic: of bags; by default the only topic with scans.
+        topic: the topic to read in a bag; by default the only one with scans.
 
     Raises:
         InputError: if the file is missing, broken, of another format, or holds several scans.
@@ -325,8 +339,8 @@ def read_all(path: Path | str, topic: str | None = None) -> Scans:
     """Return the scans of a file, a bag, a folder of these, or a dataset, with their labels if any.
 
     Args:
-        path: as INPUT of `amvnet predict`.
-        topic: of bags; by default the only topic with scans.
+        path: a file, folder or dataset, as `amvnet predict` takes it as INPUT.
+        topic: the topic to read in bags; by default the only one with scans.
 
     Returns:
         A sequence that reads each scan when it is asked for, as `read` does.

@@ -29,7 +29,7 @@ from amvnet.errors import InputError, SomeBroken, memory_for
 from amvnet.files import atomic_write, inside
 from amvnet.inference.journal import UNFINISHED, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan, LoadedScan
-from amvnet.inference.scan_stream import AHEAD, stream_groups
+from amvnet.inference.scan_stream import READ_AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
 from amvnet.outputs import Signature, check_not_read, check_outputs
 from amvnet.progress import Progress, no_progress
@@ -37,7 +37,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED
 
 UNCERTAIN_ENDING = ".uncertain.npy"
-DIGITS = 16  # of a digest in the journal
+DIGEST_LENGTH = 16  # the hexadecimal digits of a digest in the journal
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,15 @@ class OutputOptions:
 
     Attributes:
         folder: the folder of predictions.
-        kind: the format of scan files' labels, one of `writers.KINDS`; datasets have their own.
+        kind: the format of the labels of scan files, one of `writers.KINDS`; datasets have their
+            own format.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.
-        uncertain: also write (N,) bool, the uncertain points, as `.uncertain.npy`.
+        uncertain: also write which points are uncertain, (N,) bool, as `.uncertain.npy`.
         overwrite: replace files that exist.
         resume: leave out the scans that an earlier run into the same folder has done.
-        also_read: files besides the scans that the command reads; what names no file is left out.
+        also_read: other files that the command reads, which must not be replaced; what names no
+            file is ignored.
 
     Raises:
         InputError: if the format is unknown.
@@ -70,9 +72,9 @@ class OutputOptions:
         check_kind(self.kind)
 
     def files_of(self, scan: InputScan) -> dict[Path, Signature]:
-        """Return what is written for a scan, by the path relative to the folder."""
+        """Return the files that are written for a scan, by the path relative to the folder."""
         labels = scan.labels_path(self.kind)
-        ending = labels.suffix or f".{self.kind}"  # of a name that is nothing but its ending
+        ending = labels.suffix or f".{self.kind}"  # a name such as ".label" has no suffix
         files = {labels: SIGNATURES[ending]}
         if self.scores:
             files[scan.scores_path] = SCORES
@@ -81,9 +83,10 @@ class OutputOptions:
         return files
 
 
-# Segments scans in memory, given where each is from; an InputError says that one is broken.
+# A function that segments scans in memory, given the inputs that they were read from. It raises
+# InputError if a scan is broken.
 Segment = Callable[[Sequence[InputScan], Sequence[Scan]], list[Segmentation]]
-# A scan that was read and segmented, or why it could not be.
+# A scan that was read and segmented, or the error that prevented it.
 Outcome = tuple[InputScan, LoadedScan | None, Segmentation | InputError]
 Written = TypeVar("Written")
 
@@ -93,12 +96,14 @@ class Pipeline:
     """Reads, segments and writes scans at the same time.
 
     Attributes:
-        scans: the scans.
+        scans: the scans to segment.
         segment: segments scans that have been read.
-        output: what is written, and where.
+        output: which files are written, and where.
         taxonomy: the classes of the labels.
-        batch: scans that go through the networks together; the labels are the same up to rounding.
-        at_once: batches that are segmented at the same time, each with its share of the threads.
+        batch: the number of scans that go through the networks together; it changes labels only by
+            rounding.
+        at_once: the number of batches that are segmented at the same time, each with its share of
+            the threads.
     """
 
     scans: Sequence[InputScan]
@@ -114,16 +119,17 @@ class Pipeline:
         """Segment the scans, and write the results.
 
         Args:
-            settings: what the labels depend on, as JSON types; an earlier run is resumed only with
-                the same settings.
+            settings: all that the labels depend on, in JSON types; an earlier run is resumed only
+                with the same settings.
+            progress: called with the number of scans that are done, and their total.
 
         Returns:
-            The entries of the scans that are done, with those of the run that is resumed; and a
-            line for each scan that is broken.
+            The entries of the scans that are done, including scans of the run that is resumed; and
+            a line for each scan that is broken.
 
         Raises:
-            InputError: if two scans would have the same files, an output folder is that of a scan,
-                a file may not be written, or another run is writing into the folder.
+            InputError: if two scans would have the same files, a scan and its output would have the
+                same folder, a file may not be written, or another run is writing into the folder.
         """
         folder = self.output.folder
         is_new = not folder.exists()
@@ -144,12 +150,16 @@ class Pipeline:
 
         entries = journal.close()
         if is_new:
-            with suppress(OSError):  # stays unless all scans were broken
+            with suppress(OSError):  # the folder is empty only if all scans were broken
                 folder.rmdir()
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
     def _check_output(self, earlier: Mapping[str, Entry]) -> None:
-        """Raise InputError if a file may not be written: only files of `earlier` are replaced."""
+        """Raise InputError if a file may not be written.
+
+        Args:
+            earlier: the scans whose files may be replaced.
+        """
         folder = self.output.folder
         _check_names(self.scans)
         inputs = list(self.output.also_read)
@@ -172,8 +182,8 @@ class Pipeline:
     def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return the entries of an earlier run whose scans need not be segmented again.
 
-        Their files are there, and neither they nor the first scans of their recordings, by which
-        they are normalised, have changed.
+        The label files of such a scan exist. The scan has not changed, nor have the first scans of
+        its recording, which decide how it is normalised.
         """
         done = dict(earlier)
         for scan in self.scans:
@@ -188,7 +198,7 @@ class Pipeline:
 
     @cached_property
     def _origins(self) -> dict[str, str]:
-        """Digests for `Entry.origin` by scan."""
+        """The digests for `Entry.origin`, by scan."""
         first_of: dict[str, list[Any]] = {}  # by recording
         for scan in self.scans:
             first = first_of.setdefault(scan.source, [])
@@ -199,7 +209,7 @@ class Pipeline:
         for scan in self.scans:
             values = (_size_and_time(scan.path), first_of[scan.source])
             digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()
-            origins[_key(scan)] = digest[:DIGITS]
+            origins[_key(scan)] = digest[:DIGEST_LENGTH]
         return origins
 
     def stream(
@@ -208,11 +218,11 @@ class Pipeline:
         """Read, segment and write scans; only a few are in memory at a time.
 
         Args:
-            write: takes each outcome in order; only scans that cannot be read may come earlier.
-                It is called in `writers` other threads.
+            write: takes the outcomes in order, except that scans that cannot be read may come
+                earlier. `writers` other threads call it.
 
         Yields:
-            What `write` returns.
+            The values that `write` returns.
         """
         groups = stream_groups(
             scans,
@@ -226,8 +236,8 @@ class Pipeline:
         with closing(groups), ThreadPoolExecutor(writers) as pool:
             for outcome in chain.from_iterable(groups):
                 writing.append(pool.submit(write, outcome))
-                # Yield what is written at once, so that the journal has it.
-                while writing and (len(writing) > AHEAD or writing[0].done()):
+                # Yield what is written without delay, so that it gets into the journal.
+                while writing and (len(writing) > READ_AHEAD or writing[0].done()):
                     yield writing.popleft().result()
             while writing:
                 yield writing.popleft().result()
@@ -237,7 +247,7 @@ class Pipeline:
     ) -> list[Outcome]:
         """Wait for scans that are being read, and segment them together.
 
-        Scans that cannot be read come first in the result.
+        Scans that cannot be read come first in the list.
         """
         outcomes: list[Outcome] = []
         loaded: list[tuple[InputScan, LoadedScan]] = []
@@ -250,7 +260,7 @@ class Pipeline:
         return outcomes + self._segment_loaded(loaded)
 
     def _segment_loaded(self, loaded: Sequence[tuple[InputScan, LoadedScan]]) -> list[Outcome]:
-        """Segment scans together; if that fails, one by one to find those that are broken."""
+        """Segment scans together; if that fails, segment them one by one to find broken ones."""
         if not loaded:
             return []
         try:
@@ -272,7 +282,7 @@ class Pipeline:
         return self.write(scan, loaded, result)
 
     def write(self, scan: InputScan, loaded: LoadedScan, result: Segmentation) -> Entry:
-        """Write the files of a scan, the labels last: where they are, the others are too."""
+        """Write the files of a scan, the labels last: if they exist, the other files exist."""
         folder = self.output.folder
         scores_path = inside(folder, scan.scores_path)
         if self.output.scores:
@@ -289,7 +299,11 @@ class Pipeline:
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:
-    """Raise SomeBroken if some of `total` scans are broken, InputError if all are."""
+    """Raise SomeBroken if some of `total` scans are broken, InputError if all are broken.
+
+    Args:
+        faults: a line for each broken scan.
+    """
     if faults and len(faults) == total:
         others = len(faults) - 1
         more = f" (and {others} more scans, each broken)" if others else ""
@@ -321,13 +335,13 @@ def _check_folder(scan: InputScan, output: OutputOptions) -> None:
     is_own_folder = folder.resolve() == scan.path.parent.resolve()
     if is_own_folder and (labels_look_like_scans or scores_look_like_scans):
         raise InputError(
-            f"{scan.path}: expected another folder for the labels, found the scan's own; "
+            f"{scan.path}: expected another folder for the labels, found the scan's own folder; "
             "change --out"
         )
 
 
 def _size_and_time(path: Path) -> tuple[int, int]:
-    """Return a file's size, and when it changed last; zeros if there is none."""
+    """Return a file's size in bytes and time of change in nanoseconds; zeros if it is missing."""
     try:
         status = path.stat()
     except OSError:

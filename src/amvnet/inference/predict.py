@@ -19,8 +19,8 @@ from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.scan import Scan
 
-NAMED = 10  # doubtful recordings, each in a line
-# What to try if the labels are doubtful.
+NAMED = 10  # the most doubtful recordings that are named, each in a line
+# What a user can try if the labels are doubtful.
 ADVICE = (
     "check what was assumed, and try --height, --axes, --rotate or --intensity-scale, "
     "weights of another sensor, or training for yours (docs/own_sensor.md)"
@@ -46,23 +46,25 @@ def predict(
 
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
-        request: how they are labelled, and what is written for each.
+        request: how the scans are labelled, and which files are written for each.
         segmenter: computes the labels, with the weights, method and tau of the request.
-        folder: receives the files.
-        sequences, split: which scans of datasets, as `ScanOptions` takes them.
-        batch: scans that go through the networks together.
+        folder: the folder for the files.
+        sequences, split: which scans of datasets to use, as `ScanOptions` takes them.
+        batch: the number of scans that go through the networks together.
         overwrite: replace files that exist.
         resume: leave out the scans that an earlier run with an equal request has done.
-        also_read: files besides the scans that the command reads, which are not written.
-        report: takes lines about what was assumed of the sensor, and at the end how sure the labels
-            are, if there are two networks.
+        also_read: other files that the command reads, which must not be replaced.
+        progress: called with the number of scans that are done, and their total.
+        report: takes lines about what was assumed of the sensor; at the end, if there are two
+            networks, takes a line about how sure the labels are.
 
     Returns:
-        The number of label files of these scans, with the files of the run that is resumed.
+        The number of label files of these scans, including the files of the run that is resumed.
 
     Raises:
-        InputError: before anything is written, if an input is missing, its folder is that of the
-            output, or a file of the user would be replaced; at the end, if every scan is broken.
+        InputError: before anything is written, if an input is missing, the scans and the output
+            have the same folder, or a file of the user would be replaced; at the end, if every scan
+            is broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
     request = replace(request, precision=segmenter.engine.precision)  # not "auto"
@@ -102,7 +104,7 @@ def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment
     """Return a function that segments scans.
 
     Args:
-        classes: maps the labels to other classes; None leaves them.
+        classes: maps the labels to other classes; without it, they stay unchanged.
     """
     table = None if classes is None else classes.table(segmenter.taxonomy)
 
@@ -116,7 +118,11 @@ def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment
 
 
 def report_certainty(entries: Sequence[Entry], usual: float | None, report: Reporter) -> None:
-    """Say how sure the labels are, which recordings have doubtful ones, and what to try."""
+    """Report how sure the labels are, which recordings have doubtful labels, and what to try.
+
+    Args:
+        usual: the usual share of uncertain points, in [0, 1]; None if it is not known.
+    """
     points: Counter[str] = Counter()
     uncertain: Counter[str] = Counter()
     for entry in entries:

@@ -1,4 +1,4 @@
-"""Scans as some weights expect them: arrays, scan files and a user's own datasets."""
+"""Read arrays, scan files and a user's own datasets, normalised to what some weights expect."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
 
-MOST_COLUMNS = 64  # of an array of points; one with more is transposed
+# The most columns of an array of points; an array with more is taken for a transposed one.
+MOST_COLUMNS = 64
 EXPECTED = "points of shape (N, 3 or more) with columns x, y, z, intensity"
 
 
@@ -29,10 +30,10 @@ def checked_scan(
     columns: str | None = None,
     trained: TrainedIntensity | None = None,
 ) -> Scan:
-    """Return a scan, or that of an array (`array_scan`), if it has a point to segment.
+    """Return a scan, or the scan that `array_scan` makes of an array; check that it has a point.
 
     Raises:
-        InputError: as `array_scan`, or if no point is valid.
+        InputError: if `array_scan` raises it, or no point is valid.
     """
     scan = points if isinstance(points, Scan) else array_scan(points, columns, trained)
     return check_scan(scan)
@@ -41,16 +42,16 @@ def checked_scan(
 def array_scan(
     points: AnyArray, columns: str | None = None, trained: TrainedIntensity | None = None
 ) -> Scan:
-    """Return the scan of an array with the columns that a scan file may have.
+    """Return the scan of an array that has the columns of a scan file.
 
     Args:
-        points: (N, 3 or more): x, y, z in metres, intensity in [0, 1], ring; or an array with
-            fields of these names, in any order and shape, such as `read_points` of ROS returns.
+        points: (N, 3 or more) x, y, z in metres, intensity in [0, 1], ring; or an array of any
+            shape with fields of these names, in any order, such as `read_points` of ROS returns.
             Anything that `as_array` takes may stand for an array.
-        columns: their names in order, separated by commas; others than x, y, z, intensity and ring
-            are left out. By default the names of the fields, or else x, y, z, intensity in this
-            order, and the ring if the values suggest it.
-        trained: fills in the intensities if there are none, which a warning says.
+        columns: the names of the columns in order, separated by commas. Only x, y, z, intensity and
+            ring are used. By default, named fields keep their names; other columns are x, y, z and
+            intensity, followed by the ring if the values suggest it.
+        trained: fills in intensities with a warning if there are none; without it, they are 0.
 
     Raises:
         InputError: if the shape is another one, or names of columns are missing.
@@ -80,7 +81,8 @@ def array_scan(
         )
 
     table = np.empty((count, 4), np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: not valid
+    # A value that is too large for float32 becomes infinite: the point is not valid.
+    with np.errstate(over="ignore", invalid="ignore"):
         table[:, :3] = cloud.xyz
         table[:, 3] = intensity
     return Scan(table, ring=cloud.ring)
@@ -101,7 +103,7 @@ def _check_shape(array: np.ndarray) -> None:
 def normaliser_for(
     weights: Weights, sensor: Sensor | None = None, report: Reporter = report_nothing
 ) -> Normaliser:
-    """Return what normalises scan files for some weights.
+    """Return the normaliser of scan files for some weights.
 
     Args:
         sensor: what is known of the sensor; the rest is measured.
@@ -121,13 +123,13 @@ def expectation_of(weights: Weights) -> Expectation:
 
 
 def open_for_weights(spec: str, weights: Weights) -> Dataset:
-    """Open a dataset with the classes of some weights, its scans `normalised_for` these.
+    """Open a dataset with the classes of some weights; normalise its scans to the weights.
 
     Args:
-        spec: as `open_dataset` takes it.
+        spec: the dataset, as `open_dataset` takes it.
 
     Raises:
-        InputError: as `open_with_classes`.
+        InputError: if there is no such dataset, or it has other classes.
     """
     return normalised_for(weights, open_with_classes(spec, weights.taxonomy))
 
@@ -135,7 +137,8 @@ def open_for_weights(spec: str, weights: Weights) -> Dataset:
 def normalised_for(weights: Weights, dataset: Dataset) -> Dataset:
     """Return a dataset whose scans are read as some weights expect them.
 
-    The scans of the benchmarks are as they are; a user's own are normalised as `predict` does.
+    Scans of the benchmarks stay unchanged. A user's own scans are normalised, as `predict`
+    normalises scan files.
     """
     if isinstance(dataset, OwnScans):
         return normalised_by(normaliser_for(weights), dataset)
@@ -146,8 +149,8 @@ def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
     """Return a user's own scans, normalised as scan files are.
 
     Args:
-        normaliser: that of scan files. If it knows nothing of the sensor, what the dataset's file
-            says of it counts.
+        normaliser: the normaliser of scan files. If it knows nothing of the sensor, the sensor in
+            the dataset's file counts.
 
     Raises:
         InputError: if the file describes an impossible sensor.

@@ -1,4 +1,4 @@
-"""What a user asks for: how scans are labelled, and which files are written for each."""
+"""A user's request: how scans are labelled, and which files are written for each."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class LabellingRequest(Checked):
     Attributes:
         weights: trained weights.
         method, tau, precision: as `amvnet.load` takes them.
-        engine: what runs the networks.
+        engine: the name of the engine that runs the networks.
         sensor: what is known of the sensor of scan files; the rest is measured.
-        layout: what the columns of files without names hold.
-        topic: the topic of bags; None stands for the only one with scans.
-        classes: maps the classes of the weights to the classes that are written; without it, the
+        layout: the names of the columns in files that do not name them.
+        topic: the topic to read in bags; None selects the only one with scans.
+        classes: maps the classes of the weights to the classes that are written. By default, the
             classes of the weights are written.
-        kind: the format of scan files' labels, one of `writers.KINDS`.
+        kind: the format of the labels of scan files, one of `writers.KINDS`.
         scores: whether to write the probabilities of both networks.
         uncertain: whether to write which points are uncertain.
 
@@ -81,7 +81,7 @@ class LabellingRequest(Checked):
 
     @property
     def endings(self) -> tuple[str, ...]:
-        """The endings of the files that are written for each scan file, the labels first."""
+        """The endings of the files that are written for each scan file; the label file is first."""
         endings = [f".{self.kind}"]
         if self.scores:
             endings.append(".npz")
@@ -91,12 +91,13 @@ class LabellingRequest(Checked):
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """The request as JSON types: an earlier run is resumed only with equal settings."""
+        """The request in JSON types; only a run with equal settings may be resumed."""
         return {
             "weights": self.weights.digests(),
             "method": self.method,
             "precision": self.precision,
-            "engine": "int8" if self.engine == "int8" else None,  # the others give equal labels
+            # All other engines give equal labels.
+            "engine": "int8" if self.engine == "int8" else None,
             "tau": self.tau,
             "sensor": repr(self.sensor),
             "topic": self.topic,
@@ -108,7 +109,7 @@ class LabellingRequest(Checked):
         }
 
     def output(self, folder: Path, overwrite: bool = False, resume: bool = False) -> OutputOptions:
-        """Return what is written for each scan, and into which folder."""
+        """Return which files are written for each scan, and into which folder."""
         return OutputOptions(
             folder,
             self.kind,

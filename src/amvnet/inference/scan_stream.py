@@ -1,4 +1,4 @@
-"""Read scans ahead, and compute on several at the same time, as every command does."""
+"""Read scans ahead, and compute on several at the same time; every command does so."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torch
 from amvnet.progress import Progress, no_progress
 from amvnet.runtime.threads import thread_pool
 
-AHEAD = 3  # scans that are read ahead of the computing, and that may wait to be written
+READ_AHEAD = 3  # the number of scans that are read ahead; as many may wait to be written
 
 Record = TypeVar("Record")
 Loaded = TypeVar("Loaded")
@@ -32,19 +32,21 @@ def stream_groups(
     """Read scans and compute on groups of them; only a few are in memory at a time.
 
     Args:
-        load: reads a scan; called in one other thread, in the order of the records.
-        compute: takes a group of records, each with its scan as it is being read; called in
-            `at_once` other threads, or if that is 1, in this one.
-        at_once: groups that are computed at the same time, each with a share of torch's threads.
+        load: reads a scan. One other thread calls it, in the order of the records.
+        compute: takes a group of records, each with the future of its scan. `at_once` other threads
+            call it, or this thread if `at_once` is 1.
+        batch: the number of scans in a group.
+        at_once: the number of groups that are computed at the same time, each with a share of
+            torch's threads.
 
     Yields:
         The result of each group, in order. An exception of `compute` is raised in its turn.
     """
-    # Few scans share the threads of all that could be computed at the same time.
+    # If there are few groups, they share all threads.
     at_once = max(min(at_once, math.ceil(len(records) / batch)), 1)
     with ThreadPoolExecutor(1) as reader, computing_threads(at_once) as computer:
         loads = ((record, reader.submit(load, record)) for record in records)
-        reading = deque(islice(loads, max(AHEAD, batch * at_once)))
+        reading = deque(islice(loads, max(READ_AHEAD, batch * at_once)))
         computing = deque[Future[Result]]()
         # One more group than threads, so that no thread has to wait for the next.
         most_groups = at_once + 1 if at_once > 1 else 1
@@ -68,9 +70,12 @@ def stream_scans(
     at_once: int = 1,
     progress: Progress = no_progress,
 ) -> Generator[Result]:
-    """Read scans and compute on each; as `stream_groups` for groups of one scan.
+    """Read scans and compute on each, as `stream_groups` does for groups of one scan.
 
     Args:
+        load: reads a scan in one other thread.
+        compute: takes a record and its scan.
+        at_once: the number of scans that are computed at the same time.
         progress: called with the number of scans that are done, and their total.
 
     Yields:
@@ -92,7 +97,7 @@ def stream_scans(
 class CallingThread(Executor):
     """Computes in the thread that submits, with all of torch's threads.
 
-    A second thread would start its own team of OpenMP threads, and halve the speed of both.
+    A second thread would start a second team of OpenMP threads, which halves the speed of both.
     """
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:

@@ -1,4 +1,4 @@
-"""Read two models' scores of scans from files, and check them, for the late fusion."""
+"""Read two models' scores from files for the late fusion, and check them."""
 
 from __future__ import annotations
 
@@ -16,17 +16,21 @@ from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import Scan
 
-# The least probability in a fusion. If two models are wholly sure of different classes, the product
-# of their scores is otherwise 0 for every class.
-SURE = 1e-7
+# The least probability in a fusion. Without it, two models that are wholly sure of different
+# classes would give a product of 0 for every class.
+LEAST_PROBABILITY = 1e-7
 
-ROUNDING = 0.02  # sums of rows are off 1 by up to this if rounded to float16 or two decimals
+# The largest error of the sum of a row: probabilities may be rounded to float16 or two decimals.
+SUM_TOLERANCE = 0.02
 
 ENDINGS = (".npz", ".npy")
-NETWORKS = {"a": "rv", "b": "bev"}  # array of each side in a file of `amvnet predict --scores`
-TAIL = 4096  # bytes at the end of a file: the checksums of an .npz, the last points of an .npy
+# The name of each side's array in a file of `amvnet predict --scores`.
+NETWORKS = {"a": "rv", "b": "bev"}
+# The bytes at the end of a file that its digest covers: they hold the checksums of an .npz, and the
+# last points of an .npy.
+DIGESTED_BYTES = 4096
 
-# What NumPy raises for files that are not its own, truncated or corrupt.
+# The errors that NumPy raises for files that are not its own, truncated or corrupt.
 READ_ERRORS = (ValueError, EOFError, OSError, BadZipFile, zlib.error)
 
 
@@ -35,10 +39,10 @@ class ScoreFolder:
     """One model's scores of some scans, in one file per scan.
 
     Attributes:
-        side: "a" or "b". Of the two networks in a file of `amvnet predict --scores`, a is the range
-            view and b the bird's-eye view.
-        folder: folder of the files, in the layout of `amvnet predict --scores`.
-        logits: whether the scores are logits, not probabilities.
+        side: "a" or "b". In a file of `amvnet predict --scores`, a is the range-view network, and b
+            is the bird's-eye-view network.
+        folder: the folder of the files, in the layout of `amvnet predict --scores`.
+        logits: whether the scores are logits instead of probabilities.
 
     Raises:
         InputError: if there is no such folder.
@@ -58,8 +62,8 @@ class ScoreFolder:
         """Return the file of a scan's scores.
 
         Args:
-            prediction: the path of the scan's labels in a folder of predictions; the file has the
-                same one, apart from the ending.
+            prediction: the path of the scan's labels in a folder of predictions. The file of scores
+                has the same path, apart from the ending.
 
         Raises:
             InputError: if there is no such file.
@@ -76,10 +80,10 @@ class ScoreFolder:
         )
 
     def read(self, prediction: Path, scan: Scan, classes: int) -> np.ndarray:
-        """Return the (N, K) float32 class probabilities of a scan, in the file of `find`.
+        """Return the (N, K) float32 class probabilities of a scan, from the file that `find` names.
 
-        Rows of points that are not valid are not checked. Other rows are as `as_probabilities`
-        returns them.
+        The rows of valid points are checked and completed by `as_probabilities`. The rows of other
+        points are not checked.
 
         Raises:
             InputError: if there is no such file, or it does not hold scores of this scan's points.
@@ -90,7 +94,9 @@ class ScoreFolder:
         if scores.shape != (len(scan), classes):
             has_other_column = scores.shape[-1:] == (classes + 1,)
             advice = (
-                "drop the column of points without a class" if has_other_column else "give those"
+                "drop the column of points without a class"
+                if has_other_column
+                else "give the scores of this scan"
             )
             raise InputError(
                 f"{path}: expected scores of shape ({len(scan)}, {classes}), one row per point and "
@@ -133,29 +139,29 @@ class ScoreFolder:
 
 @dataclass(frozen=True)
 class ScorePair:
-    """The scores of the two models that are fused."""
+    """Two models' scores of some scans, which are fused."""
 
     a: ScoreFolder
     b: ScoreFolder
 
     def read(self, prediction: Path, scan: Scan, classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the probabilities f and g of a scan, each as `ScoreFolder.read`."""
+        """Return the probabilities f and g of a scan, as `ScoreFolder.read` returns them."""
         return self.a.read(prediction, scan, classes), self.b.read(prediction, scan, classes)
 
     def digests(self, records: Sequence[ScanRecord]) -> dict[str, str]:
-        """Return a digest of each model's scores of some scans, wherever the files lie."""
+        """Return a digest of each model's scores by side; it does not depend on the folders."""
         return {scores.side: _digest(scores, records) for scores in (self.a, self.b)}
 
 
 def as_probabilities(values: np.ndarray, name: str, advice: str) -> np.ndarray:
     """Return (P, K) scores as class probabilities.
 
-    A row of zeros, which other tools write for points outside their view, says that the model has
-    no opinion. It becomes 1/K in every class.
+    Other tools write a row of zeros for a point outside their view: the model has no opinion of it.
+    Such a row becomes 1/K in every class.
 
     Args:
         name: the beginning of error messages.
-        advice: what to do if the scores are no probabilities.
+        advice: the advice in the message if the scores are no probabilities.
 
     Raises:
         InputError: if a value is negative or not finite, a row does not add up to 1, or all rows
@@ -184,22 +190,25 @@ def as_probabilities(values: np.ndarray, name: str, advice: str) -> np.ndarray:
 
 
 def are_probabilities(values: np.ndarray) -> np.ndarray:
-    """Return (P,) bool: the rows of (P, K) finite scores that are probabilities, up to rounding."""
-    is_one: np.ndarray = np.abs(values.sum(axis=1) - 1) <= ROUNDING
+    """Return (P,) bool: whether each row of (P, K) finite scores holds probabilities.
+
+    The probabilities may be rounded (`SUM_TOLERANCE`).
+    """
+    is_one: np.ndarray = np.abs(values.sum(axis=1) - 1) <= SUM_TOLERANCE
     return is_one & (values >= 0).all(axis=1)
 
 
 def have_opinion(values: np.ndarray) -> np.ndarray:
-    """Return (P,) bool: the rows of (P, K) probabilities that prefer a class."""
+    """Return (P,) bool: whether each row of (P, K) probabilities prefers a class."""
     return (values != values[:, :1]).any(axis=1)
 
 
 def check_logits(values: np.ndarray, name: str) -> None:
-    """Check (P, K) scores before softmax.
+    """Check (P, K) scores to which softmax is to be applied.
 
     Raises:
-        InputError: if one is not finite, or most rows are probabilities already, whose softmax is
-            nearly the same for all classes.
+        InputError: if a score is not finite, or most rows are already probabilities: their softmax
+            would be nearly the same for all classes.
     """
     check_finite(values, name)
     if np.count_nonzero(are_probabilities(values)) > len(values) / 2:
@@ -225,7 +234,7 @@ def _digest(scores: ScoreFolder, records: Sequence[ScanRecord]) -> str:
         path = scores.find(Path(record.prediction))
         size = path.stat().st_size
         with path.open("rb") as file:
-            file.seek(max(size - TAIL, 0))
+            file.seek(max(size - DIGESTED_BYTES, 0))
             end = file.read()
         digest.update(f"{record.name} {size} ".encode() + end)
 

@@ -1,4 +1,4 @@
-"""The result for one scan: labels, scores, uncertain points, and what to do with them."""
+"""The result for one scan: labels, scores and uncertain points, with ways to use and save them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from amvnet.models.amvnet import Scores
 from amvnet.outputs import check_outputs
 from amvnet.scan import Scan
 
-NAMED = 3  # classes in the short description of a result
+NAMED = 3  # the most classes that the short description of a result names
 
-# A share of uncertain points is unusual if its odds are more than this multiple of the usual odds.
-# Unlike a difference of shares, the odds suit every tau: for weights of simulated streets, real
-# scans of the right sensor have up to 5 times the usual odds at a tau of 0.5 and of 0.82, and scans
-# in another frame or unit more (docs/log.md).
+# The ratio of the odds of an uncertain point to the usual odds, above which labels are doubtful.
+# A ratio of odds suits every tau, a difference of shares does not. With weights from simulated
+# streets, real scans of the right sensor have a ratio of up to 5, both at a tau of 0.5 and at 0.82;
+# scans in another frame or unit have a larger one (docs/log.md).
 UNUSUAL_ODDS = 5.0
 
 
@@ -32,8 +32,8 @@ class Verdict:
 
     Attributes:
         share: the share of the points that are uncertain, in [0, 1].
-        usual: this share in the scans that the weights were validated on; None if it is not known,
-            as for another tau.
+        usual: this share in the scans that the weights were validated on, in [0, 1]; None if it is
+            not known, for example because tau is another one.
     """
 
     share: float
@@ -41,7 +41,7 @@ class Verdict:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether so many points are uncertain that the weights do not know such scans.
+        """Whether so many points are uncertain that the weights hardly know such scans.
 
         False if the usual share is not known.
         """
@@ -51,7 +51,7 @@ class Verdict:
 
     @property
     def shares(self) -> str:
-        """Both shares, as text."""
+        """Both shares as text, in percent."""
         text = f"{self.share:.1%} of the points are uncertain"
         return text if self.usual is None else f"{text} (usual: {self.usual:.1%})"
 
@@ -64,13 +64,13 @@ class Origin:
     """The scan of a result, and what labelled it.
 
     Attributes:
-        scan: as the networks saw it.
-        taxonomy: the classes.
-        method: the method of the labels.
-        usual_uncertain: the share of uncertain points that the weights had in their validation, or
+        scan: the scan, normalised to the weights.
+        taxonomy: the classes of the labels.
+        method: the method that gave the labels.
+        usual_uncertain: the share of uncertain points in the validation of the weights, in [0, 1];
             None if it is not known for this tau.
-        path: the file of the scan, or None if it was in memory.
-        file_xyz: (N, 3) the coordinates as they are in the file, or None if it was in memory.
+        path: the file of the scan; None if the scan was in memory.
+        file_xyz: (N, 3) the unchanged coordinates of the file; None if the scan was in memory.
         assumed: what was assumed of the scan's sensor; empty if the scan was in memory.
     """
 
@@ -91,12 +91,12 @@ class Segmentation:
 
     Attributes:
         labels: (N,) uint8 train ids 1..K; 0 for points that are not valid.
-        uncertain: (N,) bool, the points on which the two networks disagree; all False for a single
-            network.
-        scores: (N, K) float32; the label of a point is c + 1 for its largest column c. Rows of the
-            geometric mean (the ensemble, and AMVNet's certain points) do not sum to 1, as in the
-            paper; those of `probabilities` do.
-        rv, bev: (N, K) float32 class probabilities by each network, or None if it did not run.
+        uncertain: (N,) bool, the points on which the two networks disagree (section 3.2 of the
+            paper); all False for a single network.
+        scores: (N, K) float32; the label of a point is c + 1 for its largest column c. Where the
+            scores are a geometric mean (in the ensemble, and for AMVNet's certain points), rows do
+            not sum to 1, as in the paper; the rows of `probabilities` do.
+        rv, bev: (N, K) float32 class probabilities by each network; None if it did not run.
         origin: the scan and what labelled it; None for the late fusion alone.
     """
 
@@ -132,17 +132,17 @@ class Segmentation:
 
     @property
     def has_two_networks(self) -> bool:
-        """Whether both networks ran, so that it is known which points are uncertain."""
+        """Whether both networks ran; only then can points be uncertain."""
         return self.rv is not None and self.bev is not None
 
     @property
     def probabilities(self) -> NDArray[np.float32]:
-        """(N, K) class probabilities: the scores, with rows that sum to 1 if a point is valid."""
+        """(N, K) class probabilities: the scores, scaled so that rows of valid points sum to 1."""
         sums = self.scores.sum(axis=1, keepdims=True)
         is_scoreless = sums[:, 0] == 0
         sums[is_scoreless] = 1
         shares: NDArray[np.float32] = self.scores / sums
-        # Two networks that are wholly sure of different classes leave no score at all.
+        # Two networks that are wholly sure of different classes leave a score of 0 for every class.
         shares[is_scoreless & (self.labels > 0)] = 1 / max(shares.shape[1], 1)
         return shares
 
@@ -163,7 +163,7 @@ class Segmentation:
 
     @property
     def raw_ids(self) -> NDArray[np.uint32]:
-        """(N,) the labels as the benchmark's files have them (10 is a car of SemanticKITTI)."""
+        """(N,) the labels as ids of the benchmark's files (a car of SemanticKITTI is 10)."""
         raw: NDArray[np.uint32] = self.require_origin().taxonomy.to_raw(self.labels)
         return raw
 
@@ -180,21 +180,21 @@ class Segmentation:
 
     @property
     def assumed(self) -> str:
-        """What was assumed of the sensor to normalise the scan of a file; else empty."""
+        """What was assumed of the sensor to normalise the scan; empty if it was in memory."""
         return "" if self.origin is None else self.origin.assumed
 
     def save(self, path: Path | str) -> Path:
-        """Write the labels, in the format of the path's ending; earlier labels are replaced.
+        """Write the labels, in the format that the path's ending names; replace earlier labels.
 
-        `.label` and `.npy` hold the raw ids; `.ply` the points too, coloured by class,
-        with the coordinates of the scan's file (`write_scan_labels` describes them).
+        `.label` and `.npy` hold the raw ids. `.ply` holds the points, coloured by class, with the
+        coordinates of the scan's file. `write_scan_labels` describes the formats.
 
         Returns:
             The path.
 
         Raises:
-            InputError: if the ending is another one, the file is that of the scan itself or holds
-                something else than labels, or it cannot be written.
+            InputError: if the format is unknown, the path names the scan's own file or a file that
+                holds no labels, or it cannot be written.
         """
         origin = self.require_origin()
         path = Path(path)
@@ -217,11 +217,15 @@ class Segmentation:
         )
 
     def require_origin(self) -> Origin:
-        """Return the origin; raise InputError if there is none."""
+        """Return the origin.
+
+        Raises:
+            InputError: if there is none.
+        """
         if self.origin is None:
             raise InputError(
                 "expected the result of a Segmenter, which knows its classes and points, "
-                "found one of the late fusion alone; use its labels"
+                "found a result of the late fusion alone; use its labels"
             )
         return self.origin
 
@@ -237,11 +241,11 @@ def uncertain_share(labels: np.ndarray, uncertain: np.ndarray) -> float:
 
 
 def fetch(scores: Scores) -> tuple[Tensor, Scores]:
-    """Return the labels (P,) and the scores, in CPU memory; wait for a GPU only once."""
+    """Return the labels, (P,) uint8, and the scores, in CPU memory; wait for a GPU only once."""
     on_gpu = scores.merged.is_cuda
 
     def copy(values: Tensor) -> Tensor:
-        return values.to("cpu", non_blocking=on_gpu)  # into pinned memory if from a GPU
+        return values.to("cpu", non_blocking=on_gpu)  # from a GPU, into pinned memory
 
     labels = copy(label_ids(scores.merged))
     fetched = Scores(
@@ -260,8 +264,9 @@ def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> 
 
     Args:
         valid: (N,) bool, the scan's valid points.
-        labels, scores: of all points in the batch.
-        points: the places of the valid points in the batch.
+        labels: (P,) train ids of all points in the batch.
+        scores: the scores of all points in the batch.
+        points: the places of the scan's valid points in the batch.
     """
     return Segmentation(
         labels=expand_to_scan(labels[points], valid),
@@ -273,7 +278,7 @@ def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> 
 
 
 def expand_to_scan(values: Tensor, valid: np.ndarray) -> np.ndarray:
-    """Return (N, ...) values of all points, given (P, ...) of the valid ones; others are 0."""
+    """Return (N, ...) values, given the (P, ...) values of the valid points; others are 0."""
     valid_values = values.cpu().numpy()
     if valid.all():
         return valid_values
@@ -283,13 +288,13 @@ def expand_to_scan(values: Tensor, valid: np.ndarray) -> np.ndarray:
 
 
 def expand_labels(scores: Tensor, valid: np.ndarray) -> np.ndarray:
-    """Return (N,) uint8 train ids, 0 for points that are not valid, given (P, K) scores."""
+    """Return (N,) uint8 train ids for the (P, K) scores of the valid points; others are 0."""
     return expand_to_scan(label_ids(scores), valid)
 
 
 def label_ids(scores: Tensor) -> Tensor:
-    """Return (P,) uint8 train ids 1..K: the first column of (P, K) with the largest score."""
-    if scores.is_cpu:  # NumPy takes half of torch's time
+    """Return (P,) uint8 train ids 1..K: the first column of the largest score of (P, K)."""
+    if scores.is_cpu:  # NumPy takes half as long as torch
         best = torch.from_numpy(scores.numpy().argmax(axis=1))
     else:
         best = scores.argmax(dim=1)

@@ -23,7 +23,9 @@ from amvnet.scan import AnyArray, Scan
 from amvnet.sensors.intensity import prepare, trained_intensity
 from amvnet.weights.file import Weights
 
-LARGE = 1_000_000  # points; memory freed by larger scans is returned: no other scan could use it
+# The least number of points in a batch whose freed memory is returned to the system, because no
+# usual batch could use it.
+LARGE_BATCH = 1_000_000
 
 
 class Segmenter:
@@ -35,10 +37,10 @@ class Segmenter:
 
     Attributes:
         weights, engine: as given.
-        at_once: scans to segment at the same time, each with its share of torch's threads; by
-            default as the engine suggests.
-        intensity: the intensities of the training, to which the intensities of a scan may be
-            brought (`sensors.intensity.match_scan`); None if unknown.
+        at_once: the number of scans to segment at the same time, each with its share of torch's
+            threads; by default the number that the engine suggests.
+        intensity: how intensities are distributed in the training scans. The intensities of a scan
+            may be matched to it (`sensors.intensity.match_scan`). None if it is unknown.
     """
 
     def __init__(self, weights: Weights, engine: Engine) -> None:
@@ -50,17 +52,17 @@ class Segmenter:
 
     @property
     def taxonomy(self) -> Taxonomy:
-        """The classes."""
+        """The classes of the labels."""
         return self.weights.taxonomy
 
     @property
     def method(self) -> MethodName:
-        """The method of the labels, one of `METHODS`."""
+        """The method that gives the labels, one of `METHODS`."""
         return self.engine.method
 
     @property
     def device(self) -> str:
-        """Where the points are: "cpu", "cuda", "cuda:1", ..."""
+        """The device that holds the points: "cpu", "cuda", "cuda:1", ..."""
         return self.engine.device
 
     @property
@@ -70,7 +72,10 @@ class Segmenter:
 
     @property
     def usual_uncertain(self) -> float | None:
-        """The share of uncertain points in the validation; None for another tau."""
+        """The share of uncertain points in the validation, in [0, 1].
+
+        None if the file does not state it for this tau.
+        """
         return self.weights.usual_uncertain_at(self.engine.tau)
 
     def __repr__(self) -> str:
@@ -83,13 +88,15 @@ class Segmenter:
         """Segment one scan.
 
         Args:
-            points: (N, 4) x, y, z in metres and intensity in [0, 1], as an array, a tensor or a
-                list; or an array with other columns or with named fields (`array_scan`); or a
-                `Scan`; or the path of a scan file, which is normalised to the weights as `amvnet
-                predict` does.
-            columns: of an array or a file of rows, what its columns hold, such as
-                "x,y,z,intensity,ring"; by default the names of its fields, or what their number
-                and values suggest.
+            points: one of
+                - (N, 4) x, y, z in metres and intensity in [0, 1], as an array, a tensor or a list;
+                - an array with other columns or with named fields (`array_scan`);
+                - a `Scan`;
+                - the path of a scan file. The scan is normalised to the weights, as `amvnet
+                  predict` normalises it.
+            columns: the names of the columns of an array or of a file of rows, such as
+                "x,y,z,intensity,ring". By default, named fields keep their names, and other columns
+                are recognised by their number and their values.
 
         Raises:
             InputError: if there is no valid point, more than a few intensities are out of range,
@@ -115,10 +122,10 @@ class Segmenter:
         """Segment several scans in one pass of the networks, which suits a GPU.
 
         Args:
-            scans: each as the points of one scan, but no path.
+            scans: arrays or `Scan`s, as `__call__` takes them as `points`; paths are not taken.
 
         Raises:
-            InputError: if one cannot be segmented; segment them one by one to see which.
+            InputError: if a scan cannot be segmented; segment them one by one to see which.
         """
         checked = []
         for scan in scans:
@@ -126,8 +133,8 @@ class Segmenter:
         return self._segment(checked)
 
     def _segment(self, scans: Sequence[Scan]) -> list[Segmentation]:
-        """Segment scans, each with a valid point, in one pass."""
-        is_large = sum(map(len, scans)) >= LARGE
+        """Segment scans in one pass; each has a valid point."""
+        is_large = sum(map(len, scans)) >= LARGE_BATCH
         with return_freed_memory() if is_large else nullcontext():
             batch = self.batch(scans)
             labels, scores = fetch(self.engine.score(batch))
@@ -142,18 +149,19 @@ class Segmenter:
     def each(self, path: Path | str, topic: str | None = None) -> Iterator[Segmentation]:
         """Segment the scans of a file, a bag, a folder of these, or a dataset, one after the other.
 
-        Scans of files and bags are normalised to the weights as `amvnet predict` does; all of one
-        folder or bag alike.
+        Scans of files and bags are normalised to the weights, as `amvnet predict` normalises them.
+        All scans of one folder or bag are normalised alike.
 
         Args:
-            path: as INPUT of `amvnet predict`.
-            topic: of bags; by default the only topic with scans.
+            path: a file, folder or dataset, as `amvnet predict` takes it as INPUT.
+            topic: the topic to read in bags; by default the only one with scans.
 
         Returns:
             An iterator that reads and segments one scan at a time.
 
         Raises:
-            InputError: if there is no scan; by the iterator, if one cannot be read or segmented.
+            InputError: if there is no scan. The iterator raises it if a scan cannot be read or
+                segmented.
         """
         scans, assumed = self._open(path, topic)
         return (self._segment_input(scan, assumed) for scan in scans)
@@ -161,7 +169,10 @@ class Segmenter:
     def _open(
         self, path: Path | str, topic: str | None = None, layout: RowLayout = UNKNOWN
     ) -> tuple[Sequence[InputScan], list[str]]:
-        """Return the scans of a path, and a list that receives what is assumed of them."""
+        """Return the scans of a path, and a list.
+
+        When the scans are read, the list receives a line on what was assumed of their sensor.
+        """
         assumed: list[str] = []
         normaliser = normaliser_for(self.weights, report=assumed.append)
         options = ScanOptions(topic=topic, layout=layout)
@@ -169,7 +180,7 @@ class Segmenter:
         return scans, assumed
 
     def _segment_input(self, scan: InputScan, assumed: list[str]) -> Segmentation:
-        """Read and segment a scan of `_open`."""
+        """Read and segment one of the scans that `_open` returned."""
         loaded = scan.load(labels=True)
         result = self(loaded.scan)
 
@@ -180,10 +191,11 @@ class Segmenter:
         return replace(result, origin=origin)
 
     def batch(self, scans: Sequence[Scan]) -> PointBatch:
-        """Return the valid points of some scans on the device, as the networks take them.
+        """Return the P valid points of some scans as one batch on the device.
 
-        The intensities of each scan are matched to the training's, if the weights say so.
-        If the rows of the range image are lasers, they are looked for in scans without rings.
+        If the weights say so, the intensities of each scan are matched to the training scans. If
+        the rows of the range image are lasers, and a scan has no rings, its lasers are recovered
+        from the order of its points (`with_lasers`).
 
         Raises:
             InputError: if more than a few intensities are out of range.

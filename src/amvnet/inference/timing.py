@@ -1,4 +1,4 @@
-"""Time per stage from a scan's file to its written labels."""
+"""Time each stage from a scan's file to its written labels."""
 
 from __future__ import annotations
 
@@ -23,20 +23,25 @@ from amvnet.scan import Scan
 
 STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")
 FUSION = ("compare", "neighbours", "head", "merge")
-MEAN = "mean"  # what the ensemble does instead of the fusion
-WARM_UP = 2  # runs that do not count
+MEAN = "mean"  # the stage of the ensemble, which takes the place of the fusion
+WARM_UP_RUNS = 2  # the number of first runs that do not count
 MEBIBYTE = 2**20
 
 Read = Callable[[], Scan]
 Write = Callable[[np.ndarray], object]
 
-
-TIMES = Signature("figures of bench", rb'\{\s*"engine": ')
+FIGURES = Signature("figures of bench", rb'\{\s*"engine": ')
 
 
 @dataclass(frozen=True)
 class Timing:
-    """The seconds of each stage and of `MEAN`, and the numbers of points."""
+    """The time of one run.
+
+    Attributes:
+        seconds: the seconds of each of the `STAGES`, and of `MEAN`.
+        points: the number of valid points.
+        uncertain: the number of uncertain points.
+    """
 
     seconds: dict[str, float]
     points: int
@@ -44,23 +49,30 @@ class Timing:
 
     @property
     def total(self) -> float:
-        """Seconds from the file to the written labels."""
+        """The seconds from the file to the written labels."""
         return sum(self.seconds[stage] for stage in STAGES)
 
     def share_of(self, stages: Sequence[str]) -> float:
-        """Return the share of some stages in this time."""
+        """Return the share of some stages in the total, in [0, 1]."""
         return sum(self.seconds[stage] for stage in stages) / self.total
 
 
 def time_runs(
     segmenter: Segmenter, read: Read, write: Write, runs: int, progress: Progress = no_progress
 ) -> dict[str, Any]:
-    """Time at least one run, after those that warm up; return a report for JSON."""
+    """Time runs, after `WARM_UP_RUNS` that do not count; return a report for JSON.
+
+    Args:
+        segmenter: runs all of AMVNet.
+        read: reads the scan.
+        write: writes its (P,) train ids.
+        runs: the number of runs that count, at least 1.
+    """
     timings = []
-    for run in range(runs + WARM_UP):
+    for run in range(runs + WARM_UP_RUNS):
         timings.append(run_once(segmenter, read, write))
-        progress(run + 1, runs + WARM_UP)
-    return _report(segmenter, timings[WARM_UP:])
+        progress(run + 1, runs + WARM_UP_RUNS)
+    return _report(segmenter, timings[WARM_UP_RUNS:])
 
 
 @torch.inference_mode()
@@ -68,7 +80,7 @@ def run_once(segmenter: Segmenter, read: Read, write: Write) -> Timing:
     """Read, segment and write a scan, with a clock around each step of `AMVNet.forward`.
 
     Args:
-        segmenter: with all of AMVNet.
+        segmenter: runs all of AMVNet.
         read: reads the scan.
         write: writes its (P,) train ids.
     """
@@ -96,7 +108,7 @@ def run_once(segmenter: Segmenter, read: Read, write: Write) -> Timing:
 
 @contextmanager
 def _watched(model: AMVNet, watch: Watch) -> Iterator[None]:
-    """Let a model run its steps one after the other, each watched."""
+    """Let a model run its steps one after the other, and time each by `watch`."""
     before = model.watch, model.arrange
     model.watch = watch
     model.arrange = one_after_the_other
@@ -107,7 +119,7 @@ def _watched(model: AMVNet, watch: Watch) -> Iterator[None]:
 
 
 class _Clock:
-    """Seconds by stage; waits for a GPU to finish before it is read."""
+    """Adds up the seconds of each stage; waits for a GPU at the end of a stage."""
 
     def __init__(self, device: str) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -148,6 +160,6 @@ def _report(segmenter: Segmenter, timings: Sequence[Timing]) -> dict[str, Any]:
 
 
 def _spread(values: Sequence[float]) -> dict[str, float]:
-    """Return the median and the quartiles."""
+    """Return the median and the quartiles of some values."""
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75)).tolist()
     return {"median": median, "low": low, "high": high}

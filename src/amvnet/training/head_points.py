@@ -19,7 +19,7 @@ from amvnet.config.schema import HeadTraining
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
-from amvnet.inference.scores import SURE
+from amvnet.inference.scores import LEAST_PROBABILITY
 from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
@@ -223,8 +223,8 @@ class PointGatherer:
         assert self.plan.scores is not None
         classes = self.weights.taxonomy.size
         f, g = self.plan.scores.read(Path(record.prediction), scan, classes)
-        f_valid = torch.from_numpy(f[scan.valid]).clamp_min(SURE)
-        g_valid = torch.from_numpy(g[scan.valid]).clamp_min(SURE)
+        f_valid = torch.from_numpy(f[scan.valid]).clamp_min(LEAST_PROBABILITY)
+        g_valid = torch.from_numpy(g[scan.valid]).clamp_min(LEAST_PROBABILITY)
         return f_valid.to(self._device), g_valid.to(self._device)
 
     def _gather(

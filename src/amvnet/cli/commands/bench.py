@@ -37,11 +37,11 @@ def bench(
     from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
     from amvnet.files import atomic_write, temporary_folder
-    from amvnet.inference.timing import TIMES, time_runs
+    from amvnet.inference.timing import FIGURES, time_runs
     from amvnet.outputs import check_outputs
 
     if json is not None:
-        check_outputs({json: TIMES}, [weights, scan], overwrite)
+        check_outputs({json: FIGURES}, [weights, scan], overwrite)
     segmenter = load_segmenter(weights, "amvnet", compute, tau)
 
     with temporary_folder() as folder:
