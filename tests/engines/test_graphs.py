@@ -18,7 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from amvnet.engines import torch as torch_engine
-from amvnet.engines.graphs import MOST_SHAPES, WARM_UP, Captured, GraphCheck
+from amvnet.engines.graphs import MOST_SHAPES, WARM_UP_RUNS, Captured, GraphCheck
 from amvnet.engines.precision import InPrecision
 from amvnet.engines.torch import TorchEngine
 from amvnet.models import upsampled_conv
@@ -240,7 +240,7 @@ def test_a_network_is_captured_once_for_each_shape_and_replayed(
     for output, right in zip(outputs, expected, strict=True):
         assert torch.equal(output, right)
     assert len(cuda) == 2
-    assert counted.count == 2 * (WARM_UP + 1)
+    assert counted.count == 2 * (WARM_UP_RUNS + 1)
 
 
 def test_gradients_and_further_shapes_are_not_captured(cuda: list[Recording]) -> None:

@@ -129,7 +129,7 @@ def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pytest.importorskip("embreex")
-    monkeypatch.setattr(int8, "SCANS", 3)
+    monkeypatch.setattr(int8, "MOST_SCANS", 3)
     weights = load("sim-hdl64e")
     scan = int8.calibration_scans("simulated", weights)[0]
 
@@ -187,7 +187,7 @@ def test_other_engines_and_missing_libraries_are_one_line(
     fails(lambda: amvnet.load(WEIGHTS, engine=engine), "tensorrt", "onnx")
     fails(lambda: amvnet.load("sim-hdl64e", engine=engine), "tensorrt")
 
-    monkeypatch.setattr("amvnet.export.onnx.EXTRA", ("no_such_library",))
+    monkeypatch.setattr("amvnet.export.onnx.LIBRARIES", ("no_such_library",))
     fails(lambda: amvnet.load(WEIGHTS, engine="onnx"), "no_such_library", "amvnet[export]")
 
 

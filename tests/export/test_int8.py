@@ -222,7 +222,7 @@ def test_calibrating_with_a_bad_scan_is_one_line(
 def test_calibrating_for_a_sensor_that_cannot_be_simulated_is_one_line(
     weights: Weights, tmp_path: Path
 ) -> None:
-    check_refused(weights, int8_export.SIMULATED, tmp_path, "scans of it to amvnet export")
+    check_refused(weights, int8_export.SIMULATED, tmp_path, "scans of this sensor to amvnet export")
 
 
 def test_graphs_that_change_too_many_labels_are_one_line(

@@ -1,4 +1,4 @@
-"""The seam between a segmenter and what runs the two networks."""
+"""What a segmenter needs of an engine, which runs the two networks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ from amvnet.runtime.memory import available_memory
 from amvnet.runtime.threads import survive_forks
 from amvnet.weights.file import Weights
 
-SCAN_BYTES = 2**30  # memory budget per scan; one of 120,000 points takes half, at the paper's size
+# The memory budget per scan, bytes. A scan of 120,000 points takes half of it in networks of the
+# paper's size.
+SCAN_BYTES = 2**30
 
 Network = Callable[[Tensor], Tensor]
 
@@ -27,20 +29,21 @@ Network = Callable[[Tensor], Tensor]
 class Engine:
     """Scores the points of scans by a method.
 
-    Torch projects and fuses. A derived class decides what runs the two networks, and builds a model
-    with these networks.
+    Torch projects the points and fuses the scores. A derived class decides what runs the two
+    networks, and builds a model with these networks.
 
     Args and attributes:
-        name: as `amvnet.load` takes it: "torch", "onnx" or "int8".
+        name: the name of the engine: "torch", "onnx" or "int8".
         model: AMVNet, whose two networks the engine runs.
         method: how the points are scored, one of `METHODS`.
-        tau: the threshold of the assertion, in [0, 1]; None if it is the one of the weights.
-        device: where the points are: "cpu", "cuda", "cuda:1", ...
+        tau: the threshold of the assertion, in [0, 1]; None if it is the threshold of the weights.
+        device: the device that holds the points: "cpu", "cuda", "cuda:1", ...
         precision: the precision of the two networks.
 
     Attributes:
-        at_once: scans to segment at the same time, each with its share of torch's threads. By
-            default on a CPU, one for each thread if the memory suffices; else 1.
+        at_once: the number of scans to segment at the same time, each with its share of torch's
+            threads. On a CPU, by default one scan for each thread, or as many as the memory
+            suffices for; on a GPU 1.
     """
 
     def __init__(
@@ -71,7 +74,11 @@ class Engine:
 
     @torch.inference_mode()
     def score(self, batch: PointBatch) -> Scores:
-        """Return the scores of the points of a batch, which are on the device."""
+        """Return the scores of the points of a batch.
+
+        Args:
+            batch: points on the engine's device.
+        """
         model = self.model
         if METHODS[self.method].has_two_networks:
             return model(batch)
@@ -86,7 +93,7 @@ class Engine:
 
 
 class WithUnet(nn.Module):
-    """PolarNet with a U-Net that something else computes; the U-Net has most of the work."""
+    """PolarNet whose U-Net, which has most of the work, is run by something else than torch."""
 
     def __init__(self, net: PolarNet, unet: Network) -> None:
         super().__init__()
@@ -100,10 +107,13 @@ class WithUnet(nn.Module):
 def build_model(
     weights: Weights, method: MethodName, tau: float | None = None, device: str = "cpu"
 ) -> AMVNet:
-    """Return AMVNet with trained weights, as a method predicts with it; it cannot be trained.
+    """Return AMVNet with trained weights, set up for a method; it cannot be trained.
 
     Args:
-        tau: the threshold of the assertion; None takes the one of the weights.
+        weights: trained weights.
+        method: how the points are scored, one of `METHODS`.
+        tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
+        device: the device for the parameters.
 
     Raises:
         InputError: if the weights lack a part that the method needs, there is no such method, or

@@ -1,4 +1,4 @@
-"""Networks captured as CUDA graphs: one launch replays hundreds of kernels."""
+"""Capture networks as CUDA graphs: one launch then replays hundreds of kernels."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from amvnet.errors import reason_of
 from amvnet.models.amvnet import Scores
 from amvnet.models.views.points import PointBatch
 
-WARM_UP = 2  # runs before the capture, in which libraries choose their algorithms
-MOST_SHAPES = 8  # captured for a network; its memory grows with each
-# A point differs if a probability changes by more than this share of the point's largest one. The
-# rounding of bfloat16 changes hardly any point by half as much (docs/log.md).
+WARM_UP_RUNS = 2  # runs before the capture, in which libraries choose their algorithms
+MOST_SHAPES = 8  # the most shapes that are captured for a network; each takes memory
+# The largest change of a point's probabilities by graphs, as a share of its largest probability.
+# The rounding of bfloat16 changes hardly any point by half as much (docs/log.md).
 LARGEST_CHANGE = 0.1
-LARGEST_SHARE = 0.001  # of points that may differ
+LARGEST_SHARE = 0.001  # the largest share of points that may change more
 
 
 class GraphCheck:
@@ -44,15 +44,18 @@ class GraphCheck:
         return self.is_passed and not self._is_paused
 
     def score(self, score: Callable[[PointBatch], Scores], batch: PointBatch) -> Scores:
-        """Score a batch; compare the first one of each number of scans with scores without graphs.
+        """Score a batch; check the graphs on the first batch of each number of scans.
+
+        The check compares the scores by graphs with scores without graphs, and returns the latter.
 
         Args:
             score: scores a batch by a model whose networks are `Captured`.
+            batch: points on the GPU.
         """
         if not self.is_passed or batch.count in self._checked:
             return score(batch)
 
-        # The batch is scored by graphs first: this captures them.
+        # The first pass captures the graphs.
         with self._lock:
             replayed = score(batch)
             with self._paused():
@@ -85,7 +88,13 @@ class GraphCheck:
 
 @dataclass(frozen=True)
 class Graph:
-    """A captured network: `replay` computes `output` from what `input` holds at that time."""
+    """A captured network.
+
+    Attributes:
+        input: the tensor from which a replay reads its input.
+        output: the tensor into which a replay writes its output.
+        replay: computes `output` from the current values of `input`.
+    """
 
     input: Tensor
     output: Tensor
@@ -95,10 +104,10 @@ class Graph:
 class Captured(nn.Module):
     """A network that is captured once for each shape of its input, and replayed from then on.
 
-    The network maps one tensor on a GPU to another. Its shapes must follow from the shape of the
-    input, and it must not wait for the GPU. Its kernels are launched one by one if the check has
-    turned graphs off, with gradients, and for shapes beyond the first `MOST_SHAPES`. Several
-    threads may call it.
+    The network maps one tensor on a GPU to another. All its shapes must follow from the shape of
+    the input, and it must not wait for the GPU. Its kernels are launched one by one if the check
+    has turned graphs off, if gradients are computed, and for shapes after the first `MOST_SHAPES`.
+    Several threads may call it.
     """
 
     def __init__(self, net: Network, check: GraphCheck) -> None:
@@ -106,7 +115,7 @@ class Captured(nn.Module):
         self.net = net
         self.check = check
         self._graphs: dict[Any, Graph] = {}  # by what the kernels depend on
-        self._pool: Any = None  # of memory, which all graphs of the network share
+        self._pool: Any = None  # the pool of memory that all graphs of the network share
         self._lock = Lock()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -123,7 +132,7 @@ class Captured(nn.Module):
             return graph.output.clone()
 
     def _graph_for(self, x: Tensor) -> Graph | None:
-        """Return the graph for inputs like x, captured if necessary; None if there can be none."""
+        """Return the graph for inputs like x; None if it cannot be captured."""
         precision = torch.get_float32_matmul_precision()
         key = (x.shape, x.stride(), x.dtype, torch.is_inference_mode_enabled(), precision)
         if key in self._graphs:
@@ -133,34 +142,34 @@ class Captured(nn.Module):
 
         try:
             self._graphs[key] = self._capture(x)
-        except RuntimeError as error:  # also if the memory does not suffice
+        except RuntimeError as error:  # such as too little memory
             self.check.fail(f"a network could not be captured ({reason_of(error)})")
         return self._graphs.get(key)
 
     def _capture(self, x: Tensor) -> Graph:
-        # Zeros instead of x, so that the check sees whether a replay takes the input.
+        # The capture computes on zeros, so that the check sees whether a replay takes its input.
         static = torch.zeros_like(x)  # keeps the strides
 
-        # CUDA wants the runs that warm up on another stream than the current one.
+        # CUDA requires that the runs before the capture use another stream than the current one.
         current = torch.cuda.current_stream(x.device)
         side = torch.cuda.Stream(x.device)
         side.wait_stream(current)
         with torch.cuda.stream(side):
-            for _ in range(WARM_UP):
+            for _ in range(WARM_UP_RUNS):
                 self.net(static)
         current.wait_stream(side)
 
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
         graph = torch.cuda.CUDAGraph()
-        # Other threads may go on using the GPU, such as one that reads scans into pinned memory.
+        # Other threads may use the GPU during the capture: one reads scans into pinned memory.
         with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
             output = self.net(static)
         return Graph(static, output, graph.replay)
 
 
 def _agree(replayed: Scores, expected: Scores) -> bool:
-    """Return whether the probabilities of both networks are the same, up to rounding."""
+    """Return whether the probabilities of both networks agree, up to rounding."""
     for f, g in ((replayed.rv, expected.rv), (replayed.bev, expected.bev)):
         if f is None or g is None:
             continue

@@ -1,4 +1,4 @@
-"""ONNX Runtime as the engine, with graphs in float32 or in 8-bit integers."""
+"""The engine of ONNX Runtime, with graphs in float32 or in 8-bit integers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from amvnet.models.methods import METHODS, EngineName, MethodName, Precision
 from amvnet.models.polar_net import PolarNet
 from amvnet.weights.file import Weights
 
-# ONNX Runtime's execution providers, the fastest first
+# ONNX Runtime's execution providers, the fastest first.
 TENSORRT = "TensorrtExecutionProvider"
 PROVIDERS = (TENSORRT, "CUDAExecutionProvider", "CPUExecutionProvider")
 RANGE_NET = "range_net"  # the graph of the range-view network
@@ -28,11 +28,10 @@ UNET = "polar_map"  # the graph of the U-Net in the bird's-eye-view network
 
 
 def check_choice(engine: EngineName, device: str, precision: Precision) -> None:
-    """Check what is asked of an engine.
+    """Check that an engine of ONNX Runtime has a device and a precision.
 
     Raises:
-        InputError: if there is no such engine, or ONNX Runtime does not have the device or the
-            precision.
+        InputError: if there is no such engine, or it does not have the device or the precision.
     """
     engines = get_args(EngineName)
     if engine not in engines:
@@ -50,11 +49,11 @@ def check_choice(engine: EngineName, device: str, precision: Precision) -> None:
 
 @dataclass(frozen=True)
 class ExportedNetworks:
-    """Graphs that `amvnet export` writes.
+    """The graphs of both networks, as `amvnet export` writes them.
 
     Attributes:
-        files: the contents of the files of `RANGE_NET` and `UNET`.
-        folder: the folder where the user keeps the files; None if there is none.
+        files: the contents of the graphs' files, by name: `RANGE_NET`, `UNET`, or both.
+        folder: the folder that keeps the files; None if they are not kept.
     """
 
     files: Mapping[str, bytes]
@@ -71,8 +70,8 @@ class OnnxEngine(Engine):
         weights: the weights of the graphs.
         networks: the graphs.
         method: how the points are scored, one of `METHODS`.
-        tau: the threshold of the assertion, in [0, 1]; None takes the one of the weights.
-        int8: the graphs are in int8.
+        tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
+        int8: whether the graphs are in int8.
 
     Raises:
         InputError: if the weights lack a part that the method needs, there is no such method, or
@@ -108,21 +107,21 @@ class OnnxEngine(Engine):
 
     @property
     def hardware(self) -> str:
-        """The device in words, with the provider of the networks if it is not the CPU's."""
+        """The device in words, with the provider that runs the networks if it is not the CPU's."""
         if len(self.providers) == 1:
             return self.device
         return f"{self.device} and {self.providers[0]} of ONNX Runtime"
 
 
 class OnnxGraph(nn.Module):
-    """An exported graph with one input (1, C, H, W) and one output; float32, without gradients.
+    """An exported graph with one input (1, C, H, W) and one output, in float32, without gradients.
 
-    It computes with as many threads as torch does in the thread that calls it.
+    It computes with as many threads as torch would use in the calling thread.
 
     Args:
         content: the content of the graph's file.
         providers: ONNX Runtime's execution providers, the preferred one first.
-        cache: the folder in which TensorRT keeps what it builds; None keeps nothing.
+        cache: the folder in which TensorRT keeps what it builds; without it, nothing is kept.
     """
 
     def __init__(
@@ -140,7 +139,7 @@ class OnnxGraph(nn.Module):
         self.input = self.session().get_inputs()[0].name
 
     def session(self) -> Any:
-        """Return ONNX Runtime's session with the number of threads of the calling thread."""
+        """Return the session of ONNX Runtime that has as many threads as the calling thread."""
         threads = torch.get_num_threads()
         with self.lock:
             if threads not in self.sessions:
@@ -152,16 +151,16 @@ class OnnxGraph(nn.Module):
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        # Threads that wait for the next graph would take the processor from torch's.
+        # Threads that wait for the next graph would take the processor from torch's threads.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         return onnxruntime.InferenceSession(self.content, options, providers=self.providers)
 
     def forward(self, x: Tensor) -> Tensor:
-        # A forked process has none of the runtime's threads, and would wait for them forever.
+        # A forked process has no threads of the runtime, and would wait for them forever.
         if os.getpid() != self.process:
             raise InputError(
-                "expected the process that loaded an engine of ONNX Runtime, found one forked "
-                "from it; load the weights in the forked process, or use the engine torch"
+                "expected the process that loaded an engine of ONNX Runtime, found a forked copy "
+                "of it; load the weights in the forked process, or use the engine torch"
             )
         if len(x) != 1:
             raise InputError(
@@ -172,7 +171,10 @@ class OnnxGraph(nn.Module):
 
 
 def _provider_options(name: str, cache: Path | None) -> dict[str, Any]:
-    """Return the options of a provider: TensorRT builds its engine in minutes, once."""
+    """Return the options of a provider.
+
+    TensorRT builds its engine once, in minutes, and keeps it in the cache.
+    """
     if name != TENSORRT or cache is None:
         return {}
     return {"trt_engine_cache_enable": True, "trt_engine_cache_path": str(cache)}

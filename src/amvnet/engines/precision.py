@@ -1,4 +1,4 @@
-"""Where a network computes, and in which precision; its inputs and outputs stay float32."""
+"""Choose the device and the precision of a network; its inputs and outputs stay float32."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from amvnet.models.methods import ONNX_ENGINES, PRECISIONS, Precision
 
 
 class InPrecision(nn.Module):
-    """A network whose convolutions and matrix products have a precision; its scores are float32.
+    """A network that computes convolutions and matrix products in a precision; scores are float32.
 
-    On a GPU, float32 means float32: TF32, which PyTorch uses for convolutions by default, is used
-    only after `torch.set_float32_matmul_precision("high")`.
+    On a GPU, "float32" does not include TF32, which PyTorch by default uses for convolutions. TF32
+    is used only after `torch.set_float32_matmul_precision("high")`.
     """
 
     def __init__(self, net: nn.Module, device: str, precision: Precision) -> None:
@@ -29,18 +29,19 @@ class InPrecision(nn.Module):
     def forward(self, view: Any) -> Tensor:
         is_lower = self.precision != "float32"
         dtype = getattr(torch, self.precision) if is_lower else None
-        # Of the whole process: on a CPU, several threads would set it back in the wrong order.
+        # The setting belongs to the whole process. It does not matter on a CPU, where several
+        # threads would restore it in the wrong order.
         tf32 = _tf32_as_set() if self.kind == "cuda" else nullcontext()
-        # A graph must not use weights that autocast has converted and kept before its capture.
-        # Each weight is used once, so that keeping them would save nothing.
+        # Autocast must not keep converted weights: a CUDA graph would use weights that were
+        # converted before its capture. Each weight is used once, so nothing is lost.
         with tf32, torch.autocast(self.kind, dtype, enabled=is_lower, cache_enabled=False):
             return self.net(view).float()
 
 
 def choose_device(name: str, engine: str = "torch") -> str:
-    """Return the name of a device; for "auto" that is `cuda` if there is one, else `cpu`.
+    """Return the name of a device; "auto" becomes "cuda" if there is a GPU, else "cpu".
 
-    An engine of ONNX Runtime computes on the CPU.
+    For an engine of ONNX Runtime, "auto" becomes "cpu".
     """
     if name != "auto":
         return name
@@ -48,7 +49,7 @@ def choose_device(name: str, engine: str = "torch") -> str:
 
 
 def check_device(name: str) -> str:
-    """Return the name, if it is that of a device of this machine; else raise InputError."""
+    """Return the name of a device; raise InputError if this machine has no such device."""
     try:
         torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError, NotImplementedError):
@@ -57,7 +58,7 @@ def check_device(name: str) -> str:
 
 
 def choose_precision(precision: Precision, device: str) -> Precision:
-    """Return the precision; for "auto", bfloat16 on a GPU that has it, else float32.
+    """Return a precision; "auto" becomes "bfloat16" on a GPU that has it, else "float32".
 
     Raises:
         InputError: if there is no such precision, or the device does not have it.

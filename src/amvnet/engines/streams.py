@@ -1,4 +1,4 @@
-"""The two networks at the same time, on the threads of a CPU or the streams of a GPU."""
+"""Run the two networks at the same time, on the threads of a CPU or the streams of a GPU."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from amvnet.runtime.threads import run_parts
 
 
 def side_by_side(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
-    """Run both at once if a CPU's threads sleep, else one after the other."""
+    """Run both networks at the same time if threads of the CPU are idle, else in turn."""
     f, g = run_parts(lambda score: score(), (score_range, score_polar))
     return f, g
 
 
 class TwoStreams:
-    """Runs the range view's network on a stream of its own on a GPU while the other one runs."""
+    """Runs the range-view network on a second stream of a GPU while the other network runs."""
 
     def __init__(self, device: str | torch.device) -> None:
         self.device = torch.device(device)
@@ -30,7 +30,7 @@ class TwoStreams:
             f = score_range()
         g = score_polar()
 
-        # From here on, and so that the inputs' memory is reused only after both networks.
+        # What follows waits for f. It also reuses the memory of the inputs after both networks.
         current.wait_stream(self.side)
         # The memory of f belongs to the side stream, which must not reuse it too early.
         f.record_stream(current)

@@ -1,4 +1,4 @@
-"""PyTorch as the engine: on a CPU, or on a GPU with two streams, CUDA graphs and a precision."""
+"""The engine of PyTorch, on a CPU, or on a GPU with two streams, CUDA graphs and a precision."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ class TorchEngine(Engine):
     Args:
         weights: trained weights.
         method: how the points are scored, one of `METHODS`.
-        tau: the threshold of the assertion, in [0, 1]; None takes the one of the weights.
-        device: "cpu", "cuda", "cuda:1", ..., or "auto": "cuda" if there is a GPU, else "cpu".
-        precision: the precision of the two networks: "float32", "bfloat16", on a GPU "float16", or
-            "auto": bfloat16 on a GPU that has it, else float32. Everything else is computed in
-            float32, the projections in float64.
+        tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
+        device: "cpu", "cuda", "cuda:1", ..., or "auto", which is "cuda" if there is a GPU, else
+            "cpu".
+        precision: the precision of the two networks: "float32", "bfloat16", "float16" on a GPU, or
+            "auto", which is bfloat16 on a GPU that has it, else float32. The projections compute in
+            float64, everything else in float32.
         graphs: on a GPU, capture the networks as CUDA graphs (`engines.graphs`), once for each
             number of scans in a batch.
 
@@ -68,7 +69,7 @@ class TorchEngine(Engine):
         return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
     def score(self, batch: PointBatch) -> Scores:
-        """Return the scores of a batch; the first of each size also tests the CUDA graphs."""
+        """Return the scores of a batch; the first batch of each size also tests the CUDA graphs."""
         if self._graphs is None:
             return super().score(batch)
         return self._graphs.score(super().score, batch)
@@ -80,7 +81,7 @@ def is_gpu(device: str) -> bool:
 
 
 def _capture(model: AMVNet) -> GraphCheck:
-    """Let a model replay its networks as CUDA graphs, as long as the check that is returned."""
+    """Let a model replay its networks as CUDA graphs; return the check that can turn them off."""
     check = GraphCheck()
     polar_net: nn.Module = model.polar_net
     assert isinstance(polar_net, PolarNet)

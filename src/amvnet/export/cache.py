@@ -29,7 +29,7 @@ from amvnet.onnx_runner import read_description, read_graph
 from amvnet.progress import Reporter, report_nothing
 from amvnet.weights.file import Weights
 
-ATTEMPTS = 10  # to give a folder its name while other processes do the same
+RENAME_ATTEMPTS = 10  # attempts to give a folder its name while other processes do the same
 
 
 def cached_networks(
@@ -37,16 +37,18 @@ def cached_networks(
 ) -> ExportedNetworks:
     """Return the graphs of some weights from the cache; export them if the cache lacks them.
 
-    The files are compared with the digests in their description. If one differs or is missing, the
-    networks are exported again. A cache that another user can write is not used: the networks are
-    exported for this process alone. Several processes may use the cache at the same time.
+    The files are compared with the digests in their description. If a file differs or is missing,
+    the networks are exported again. A cache that another user can write is not used: the networks
+    are exported for this process alone. Several processes may use the cache at the same time.
 
     Args:
-        int8: as `export` takes it.
+        weights: trained weights.
+        int8: the scans for the calibration, as `export` takes them; by default, the graphs are in
+            float32.
         report: called with a line before long work.
 
     Raises:
-        InputError: as `export`.
+        InputError: if `export` raises it.
     """
     check_libraries()
     exported = "exported" if int8 is None else "exported and calibrated in int8"
@@ -65,7 +67,7 @@ def cached_networks(
     with suppress(InputError):
         return ExportedNetworks(_read(folder, weights), folder)
     found = "" if not folder.exists() else ", because files in the cache were missing or changed"
-    report(f"the networks are {exported}{found}, once for these weights; kept in {folder}")
+    report(f"the networks are {exported}{found}, once for these weights, and kept in {folder}")
     return ExportedNetworks(_export(weights, int8, folder), folder)
 
 
@@ -79,7 +81,7 @@ def _key(weights: Weights, int8: str | None) -> str:
 
 
 def _read(folder: Path, weights: Weights) -> dict[str, bytes]:
-    """Return the contents of the graphs of the networks; raise InputError if they are not whole."""
+    """Return the contents of the networks' graphs; raise InputError if a file is not complete."""
     description = read_description(folder)
     if description["method"] != widest_method(weights.parts):
         raise InputError(f"{folder}: expected the graphs of these weights, found others")
@@ -89,7 +91,7 @@ def _read(folder: Path, weights: Weights) -> dict[str, bytes]:
 
 
 def _export(weights: Weights, int8: str | None, folder: Path) -> dict[str, bytes]:
-    """Export into a folder of the cache, which appears whole; return what was exported."""
+    """Export into a folder of the cache, which appears whole; return the contents of the graphs."""
     make_private(folder.parent)
     part = folder.with_name(f".{uuid.uuid4().hex}.part")
     part.mkdir(PRIVATE_FOLDER)
@@ -107,12 +109,11 @@ def _export(weights: Weights, int8: str | None, folder: Path) -> dict[str, bytes
 
 
 def _publish(part: Path, folder: Path, weights: Weights) -> None:
-    """Give a finished folder its name, unless another process has exported the same.
+    """Give a finished folder its name, unless another process has exported the same graphs.
 
-    A folder of that name with other files is replaced. If the export fails, the cache does
-    not change.
+    A folder of that name with other files is replaced.
     """
-    for _ in range(ATTEMPTS):
+    for _ in range(RENAME_ATTEMPTS):
         with suppress(OSError):
             part.rename(folder)  # fails if there are files in a folder of that name
             return

@@ -1,4 +1,4 @@
-"""Exported convolutions in 8-bit integers: calibrated on some scans, checked on others."""
+"""Convert exported convolutions to 8-bit integers: calibrate on some scans, check on others."""
 
 from __future__ import annotations
 
@@ -22,21 +22,28 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.weights.file import Weights
 
-SIMULATED = "simulated"  # the name of simulated streets, seen by the weights' sensor
-SEED = 20_261_121  # of these streets, far from the seeds of any training
-SCANS = 20  # used at most, evenly spaced
+SIMULATED = "simulated"  # stands for simulated streets, as the weights' sensor sees them
+SEED = 20_261_121  # the seed of these streets, far from the seeds of any training
+MOST_SCANS = 20  # the most scans that are used, evenly spaced
 CHECK_EVERY = 5  # the first of every five scans is for the check, the others to calibrate
-LEAST_AGREEMENT = 0.9  # of labels before and after; far less than a good calibration gives
+# The least share of labels that must stay; a good calibration keeps far more.
+LEAST_AGREEMENT = 0.9
 # The graphs of convolutions, which take nearly all of the time, and whether their first layer stays
-# in float32: the range view's input has metres and a mask of 0 and 1, for which 256 steps are few.
-FIRST_KEPT = {"range_net": True, "polar_map": False}
+# in float32. The input of the range view holds metres next to a mask of 0 and 1: 256 steps for both
+# would be too coarse.
+KEEPS_FIRST_LAYER = {"range_net": True, "polar_map": False}
 
 
 def calibration_scans(text: str, weights: Weights) -> list[Scan]:
-    """Read scans of a dataset, scan files or folders of them, or simulate streets.
+    """Read up to `MOST_SCANS` scans for the calibration, or simulate streets.
+
+    Args:
+        text: a dataset, a scan file, a folder of scan files, or `SIMULATED`.
+        weights: the weights to which the scans are normalised.
 
     Raises:
-        InputError: if there are none, one is broken, or the weights' sensor cannot be simulated.
+        InputError: if there are no scans, one is broken, or the weights' sensor cannot be
+            simulated.
     """
     if text != SIMULATED:
         return _read(text, weights)
@@ -46,28 +53,29 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
     if sensor not in SENSORS:
         raise InputError(
             f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; "
-            "give scans of it to amvnet export --int8"
+            "give scans of this sensor to amvnet export --int8"
         )
     with temporary_folder() as folder:
-        simulate(folder, sensor=sensor, sequences=SCANS, scans=1, seed=SEED)
+        simulate(folder, sensor=sensor, sequences=MOST_SCANS, scans=1, seed=SEED)
         return _read(str(folder), weights)
 
 
 def quantise(
     folder: Path, names: Sequence[str], scans: Sequence[Scan]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Replace exported graphs by quantised ones, one after the other.
+    """Replace exported graphs by quantised graphs, one after the other.
 
-    The first of every five scans is for the check, the others are to calibrate. A single scan does
-    both.
+    The first of every five scans is for the check, the others are for the calibration. A single
+    scan serves for both.
 
     Args:
         folder: the output folder of `amvnet export`.
-        names: the graphs to quantise, all of them in `FIRST_KEPT`.
+        names: the graphs to quantise, all of them in `KEEPS_FIRST_LAYER`.
+        scans: the scans, normalised to the weights.
 
     Yields:
-        The name of each graph, with the new values in its description: `precision`, `sha256`, and
-        `agreement`, the share of the points whose label by this network stays.
+        The name of each graph and the new values in its description: `precision`, `sha256`, and
+        `agreement`, the share of the points whose label by this network stays, in [0, 1].
 
     Raises:
         InputError: if the agreement is below `LEAST_AGREEMENT`.
@@ -77,7 +85,7 @@ def quantise(
     recorder = _Recorder(folder)
     for name in names:
         expected = _labels(recorder, name, checking)
-        recorder.recorded[name].clear()  # of the scans for the check
+        recorder.recorded[name].clear()  # forget the scans for the check
         _labels(recorder, name, calibrating)
         path = folder / f"{name}.onnx"
         _write(path, recorder.recorded.pop(name))
@@ -93,14 +101,20 @@ def quantise(
 
 
 class _Recorder(OnnxSegmenter):
-    """Records the inputs of the graphs to quantise: for each run, an array by input name."""
+    """Segments scans, and records the inputs of the graphs to quantise.
+
+    Attributes:
+        recorded: for each graph, the input of each run, as an array by the name of the input.
+    """
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self.recorded: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in FIRST_KEPT}
+        self.recorded: dict[str, list[dict[str, np.ndarray]]] = {
+            name: [] for name in KEEPS_FIRST_LAYER
+        }
 
     def replace(self, name: str, path: Path) -> None:
-        """Run the graph of another file, which the description in the folder does not know yet."""
+        """Take a graph from another file, which the description in the folder does not list yet."""
         self._graphs[name] = open_session(path, path.read_bytes(), ["CPUExecutionProvider"])
 
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
@@ -111,19 +125,20 @@ class _Recorder(OnnxSegmenter):
 
 
 def _read(text: str, weights: Weights) -> list[Scan]:
-    """Read up to `SCANS` scans, evenly spaced, as the networks take them in `predict`."""
+    """Read up to `MOST_SCANS` scans, evenly spaced, normalised as `predict` normalises them."""
     normaliser = normaliser_for(weights)
     inputs, _ = list_inputs([text], taxonomy=weights.taxonomy, normaliser=normaliser)
     intensity = trained_intensity(weights.training, weights.sensor)
     scans = []
-    for scan_input in evenly_spaced(inputs, SCANS):
+    for scan_input in evenly_spaced(inputs, MOST_SCANS):
         scan = scan_input.load().scan
         if scan.valid.any():
             scans.append(match_scan(scan, intensity))
 
     if not scans:
         raise InputError(
-            f"{text}: expected scans to calibrate with, found none with a finite point; name others"
+            f"{text}: expected scans to calibrate with, found none with a finite point; "
+            "name other scans"
         )
     return scans
 
@@ -131,7 +146,7 @@ def _read(text: str, weights: Weights) -> list[Scan]:
 def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarray:
     """Return the column of the largest score, 0..K - 1, for the finite points of all scans.
 
-    The network that the graph `name` is a part of gives the scores.
+    The scores are given by the network that contains the graph `name`.
     """
     labels = []
     for scan in scans:
@@ -146,11 +161,11 @@ def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarr
 
 
 def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
-    """Replace a graph by its quantised version, calibrated with inputs recorded from scans.
+    """Replace a graph by its quantised version, calibrated with recorded inputs.
 
-    ONNX Runtime's kernels for x86 support unsigned activations with signed weights best. Weights
-    have seven bits, because processors without VNNI would overflow with eight. The range of a value
-    is the mean of its ranges in the scans.
+    Activations are unsigned and weights signed: ONNX Runtime's kernels for x86 support this best.
+    Weights have seven bits, because processors without VNNI would overflow with eight. The range of
+    a value is the mean of its ranges in the scans.
     """
     from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
@@ -170,7 +185,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
             per_channel=True,
             reduce_range=True,
             calibrate_method=CalibrationMethod.MinMax,
-            nodes_to_exclude=_first_layer(ready) if FIRST_KEPT[path.stem] else [],
+            nodes_to_exclude=_first_layer(ready) if KEEPS_FIRST_LAYER[path.stem] else [],
             extra_options={"CalibMovingAverage": True},
         )
 
@@ -180,7 +195,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
 
 
 def _first_layer(path: Path) -> list[str]:
-    """Return the names of the nodes up to the first activation; none if there is none."""
+    """Return the names of the nodes up to the first activation; empty if there is no activation."""
     import onnx
 
     names = []

@@ -17,7 +17,7 @@ from amvnet.config.nested import to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.engines.base import build_model
 from amvnet.errors import InputError, import_optional
-from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
+from amvnet.export.int8 import KEEPS_FIRST_LAYER, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, strip
 from amvnet.files import atomic_write, publish, temporary_folder
 from amvnet.inference.reading import expectation_of
@@ -38,12 +38,15 @@ from amvnet.weights.file import Weights, load
 
 GRAPH = Signature("an ONNX graph", rb"\x08.\x12.(pytorch|onnx)")
 DESCRIBED = Signature("a description of ONNX graphs", rb'\{\s*"format": ')
-EXTRA = ("onnx", "onnxscript", "onnxruntime")
-OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it
-LARGEST_DIFFERENCE = 1e-4  # from torch, of probabilities or of features as `_shares`
-LARGEST_WEIGHTS = 2**28  # bytes of a tensor of weights
-POINTS = 5000  # of the artificial scan that the graphs are traced and checked with
-# Names of the first axis of the graphs in which it may have any length.
+LIBRARIES = ("onnx", "onnxscript", "onnxruntime")  # what the extra `export` installs
+# The lowest opset that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it.
+OPSET = 18
+# The largest difference from torch, of probabilities or of features that `_shares` has scaled.
+LARGEST_DIFFERENCE = 1e-4
+LARGEST_WEIGHTS = 2**28  # the largest size of a tensor that is computed once, bytes
+# The number of points of the artificial scan with which the graphs are traced and checked.
+EXAMPLE_POINTS = 5000
+# The names of the first axis, for graphs in which it may have any length.
 DYNAMIC = {
     "polar_points": "points",
     "polar_pillars": "pillars",
@@ -60,8 +63,8 @@ class Graph:
         module: the part in torch.
         inputs: an example of each input, by name.
         output: the output's name.
-        compared: turns outputs into values to compare with torch: probabilities, or features as
-            `_shares`.
+        compared: turns outputs into the values that are compared with torch: probabilities, or
+            features that `_shares` has scaled.
     """
 
     module: nn.Module
@@ -92,17 +95,20 @@ def export(
 
     Args:
         weights: trained weights, or the name or path of a weights file.
-        int8: convert the convolutions to int8, calibrated with these scans: as `predict` takes
-            them, or `simulated`.
+        out: the folder.
+        progress: called with the number of graphs that are done, and their total.
+        int8: convert the convolutions to int8, calibrated with these scans: a dataset, scan files
+            as `predict` takes them, or `simulated`. By default, the graphs are in float32.
 
     Returns:
-        The descriptions of the graphs, by name. Graphs in float32 have the largest `difference`
-        from torch, graphs in int8 the `agreement`, the share of the labels that stay.
+        The descriptions of the graphs, by name. The description of a graph in float32 has the
+        largest `difference` from torch; in int8, it has the `agreement`, which is the share of the
+        labels that stay.
 
     Raises:
-        InputError: if a library is missing, the weights have no network or need labels, there are
-            no scans, or a graph differs by more than `LARGEST_DIFFERENCE` or changes too many
-            labels in int8; then the folder is as before.
+        InputError: if a library is missing, the weights hold no network, there are no scans, a
+            graph differs by more than `LARGEST_DIFFERENCE`, or int8 changes too many labels. The
+            folder then stays unchanged.
     """
     check_libraries()
     loaded = weights if isinstance(weights, Weights) else load(weights)
@@ -125,7 +131,7 @@ def export(
 
 
 def possible_files(out: Path) -> dict[Path, Signature]:
-    """Return all files that `export` may write into a folder."""
+    """Return all files that `export` may write into a folder, with the signatures of its files."""
     graphs = {out / f"{name}.onnx": GRAPH for name in GRAPHS["amvnet"]}
     return {**graphs, out / DESCRIPTION: DESCRIBED}
 
@@ -137,18 +143,22 @@ def _write_all(
     folder: Path,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Write the graphs of a method, with convolutions in int8 if there are scans; describe them."""
+    """Write the graphs of a method, with convolutions in int8 if there are scans.
+
+    Returns:
+        The description of the folder, for `amvnet.json`.
+    """
     written: dict[str, dict[str, Any]] = {}
     with torch.no_grad():
         graphs = _graphs(weights, method)
-        convolutions = [name for name in graphs if scans and name in FIRST_KEPT]
+        convolutions = [name for name in graphs if scans and name in KEEPS_FIRST_LAYER]
         total = len(graphs) + len(convolutions)
         for name, graph in graphs.items():
             progress(len(written), total)
             written[name] = _write(graph, name, folder / f"{name}.onnx")
 
     description = describe_export(weights, method, written)
-    _save(description, folder / DESCRIPTION)  # the calibration runs the graphs with it
+    _save(description, folder / DESCRIPTION)  # the calibration reads it to run the graphs
     progress(len(graphs), total)
 
     for count, (name, changes) in enumerate(quantise(folder, convolutions, scans), len(graphs) + 1):
@@ -164,7 +174,7 @@ def _save(description: dict[str, Any], path: Path) -> None:
 
 def check_libraries() -> None:
     """Raise InputError if a library of the extra `export` is not installed."""
-    for name in EXTRA:
+    for name in LIBRARIES:
         import_optional(name, "export")
 
 
@@ -218,19 +228,19 @@ def describe_export(weights: Weights, method: MethodName, graphs: dict[str, Any]
 
 
 def _intensity_range(trained: TrainedIntensity | None) -> list[float] | None:
-    """Return the range of the intensities; None if the networks were trained with others."""
+    """Return the range of the intensities, [0, 1]; None if the training had another range."""
     return [0.0, 1.0] if trained is None or trained.are_fractions else None
 
 
 def _describe_intensity(trained: TrainedIntensity | None) -> dict[str, list[float]] | None:
-    """Return what the intensities of each scan are brought to; None if they stay as they are."""
+    """Return the distribution to which intensities are matched; None if they are not matched."""
     if trained is None or not trained.is_matched:
         return None
     return {"probabilities": list(PROBABILITIES), "quantiles": list(trained.quantiles)}
 
 
 def describe_expectation(expected: Expectation) -> dict[str, Any]:
-    """Return what some weights expect of scans, for programs that normalise scans themselves."""
+    """Describe the scans that some weights expect, for programs that normalise scans themselves."""
     sensor = expected.sensor
     sheet = SENSORS.get(sensor.name)
     intensity = expected.intensity
@@ -265,7 +275,7 @@ def _graphs(weights: Weights, method: MethodName) -> dict[str, Graph]:
 
 
 def _polar_graphs(model: AMVNet, batch: PointBatch, classes: int) -> dict[str, Graph]:
-    """Return the parts of the bird's-eye-view network, between which points are pooled."""
+    """Return the graphs of the bird's-eye-view network; points are pooled between the first two."""
     net = model.polar_net
     assert isinstance(net, PolarNet)
     grid = model.polar_view.project(batch)
@@ -294,7 +304,7 @@ def _head_graph(model: AMVNet, batch: PointBatch, classes: int) -> Graph:
     f = torch.randn(count, classes, generator=generator).mul(3).softmax(dim=1)
     g = torch.randn(count, classes, generator=generator).mul(3).softmax(dim=1)
     uncertain = torch.arange(0, count, 5)
-    # Any points serve as neighbours in an example.
+    # For an example, random points serve as neighbours.
     shape = (len(uncertain), head.config.neighbours)
     near = torch.randint(count, shape, generator=generator)
 
@@ -307,12 +317,12 @@ def _artificial_scan(model: ModelConfig) -> PointBatch:
     """Return random points all around the sensor, inside and outside the views, with rings."""
     rng = np.random.default_rng(0)
     view = model.polar_view
-    azimuth = rng.uniform(-np.pi, np.pi, POINTS)
-    distance = rng.uniform(1, 1.2 * view.radius_max, POINTS)
-    height = rng.uniform(view.z_min, view.z_max, POINTS)
+    azimuth = rng.uniform(-np.pi, np.pi, EXAMPLE_POINTS)
+    distance = rng.uniform(1, 1.2 * view.radius_max, EXAMPLE_POINTS)
+    height = rng.uniform(view.z_min, view.z_max, EXAMPLE_POINTS)
     xyz = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), height], axis=1)
-    points = np.column_stack([xyz, rng.random(POINTS)]).astype(np.float32)
-    ring = rng.integers(0, model.range_view.height, POINTS)
+    points = np.column_stack([xyz, rng.random(EXAMPLE_POINTS)]).astype(np.float32)
+    ring = rng.integers(0, model.range_view.height, EXAMPLE_POINTS)
 
     return PointBatch.of([Scan(points, ring=ring)])
 
@@ -322,7 +332,7 @@ def _probabilities(scores: Tensor) -> Tensor:
 
 
 def _shares(features: Tensor) -> Tensor:
-    """Return features as shares of the largest, or as they are if all are below 1."""
+    """Divide features by the largest magnitude; leave them unchanged if it is below 1."""
     return features / features.abs().max().clamp_min(1)
 
 
@@ -348,8 +358,8 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
             verbose=False,
         )
         assert program is not None
-        # Compute weights that are sums of others (`models.upsampled_conv`) once: by default, only
-        # small tensors count as constants.
+        # Compute weights that are sums of other weights (`models.upsampled_conv`) only once, in
+        # spite of their size: by default, only small tensors count as constants.
         optimize(program.model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
         program.save(path, external_data=False)
     strip(path)
@@ -359,7 +369,7 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
     if not difference <= LARGEST_DIFFERENCE:  # also if it is NaN
         raise InputError(
             f"{name}: expected a difference of at most {LARGEST_DIFFERENCE:g} between ONNX Runtime "
-            f"and torch, found {difference:.2g}; use other versions of {', '.join(EXTRA)}"
+            f"and torch, found {difference:.2g}; use other versions of {', '.join(LIBRARIES)}"
         )
     return {
         "file": path.name,
@@ -372,7 +382,7 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:
-    """Run a graph on its examples; return descriptions of inputs and outputs, and the result."""
+    """Run a graph on its example; return descriptions of its inputs and outputs, and the result."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -388,6 +398,7 @@ def _describe_values(values: Sequence[Any]) -> list[dict[str, Any]]:
 
 
 def _difference(graph: Graph, expected: Tensor, actual: Tensor) -> float:
+    """Return the largest difference between compared values; infinity if the shapes differ."""
     if expected.shape != actual.shape:
         return float("inf")
     return float((graph.compared(expected) - graph.compared(actual)).abs().max())

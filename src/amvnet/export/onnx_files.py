@@ -1,4 +1,4 @@
-"""Handle ONNX files and the libraries that write them, with their warnings and notes."""
+"""Digest ONNX files, and remove the notes and warnings of the libraries that write them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def digest(path: Path) -> str:
 
 
 def strip(path: Path) -> None:
-    """Remove a library's notes from a graph, which contain paths of this machine."""
+    """Remove the notes of libraries from a graph: they contain paths of this machine."""
     import onnx
 
     model = onnx.load(path)
@@ -29,7 +29,7 @@ def strip(path: Path) -> None:
 
 @contextmanager
 def quiet(name: str) -> Iterator[None]:
-    """Suppress warnings, and what the logger `name` of a library says besides errors."""
+    """Suppress warnings, and all messages of a library's logger except errors."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""One self-contained HTML page that shows scans in 3D; it fetches nothing."""
+"""Write one self-contained HTML page that shows scans in 3D; the page fetches nothing."""
 
 from __future__ import annotations
 
@@ -28,18 +28,20 @@ from amvnet.models.methods import METHODS, title_of
 from amvnet.outputs import Signature, check_outputs
 from amvnet.viewing.shown_scans import RIGHT, UNLABELLED, UNSCORED, ShownScan, shown_scan
 
-# Of larger scans the page shows every second or third point, so that phones keep up.
+# The most points of a scan that the page shows. It shows every second or third point of a larger
+# scan, so that phones keep up.
 MOST_POINTS = 400_000
-# Metres along each axis. Farther points are left out, so that int16 is off by 0.8 cm at most.
+# The largest coordinate that the page shows, metres. Farther points are left out, so that rounding
+# to int16 moves a point by 0.8 cm at most.
 REACH = 500.0
-LEVELS = 32_767  # largest int16
+LEVELS = 32_767  # the largest int16
 PAGE = Signature("a page of view", rb'<!doctype html>.*<meta name="generator" content="AMVNet">')
-STOPS = 17  # colours between which the page interpolates a ramp
-# Matplotlib's colour map for each ramp, and the part of it that is used, in [0, 1].
+RAMP_STOPS = 17  # the number of colours between which the page interpolates a ramp
+# Matplotlib's colour map for each ramp, and the part of the map that is used, in [0, 1].
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
-# From no disagreement to full disagreement of the networks, RGB in 0..255.
+# The colours from no disagreement to full disagreement of the networks, RGB in 0..255.
 UNCERTAINTY_RAMP = (RIGHT, (122, 104, 132), (190, 124, 158), UNCERTAIN, (255, 205, 220))
-# In this order: later scripts use what earlier ones define.
+# The order counts: later scripts use what earlier scripts define.
 SCRIPTS = (
     "scans.js",
     "camera.js",
@@ -60,11 +62,11 @@ class Packed:
     """One scan, packed for the page.
 
     Attributes:
-        about: name, number of points and the like, for the page's JSON.
+        about: the scan's name, number of points and other properties, for the page's JSON.
         planes: the values of the points as `pack` lays them out, deflated and in base64.
-        present: train ids that appear in the ground truth and the labels.
-        heights: of the lowest points, the ground and the highest points, metres.
-        intensity: the largest in [0, 1], outliers left out.
+        present: the train ids that appear in the ground truth and the labels.
+        heights: the heights of the lowest points, of the ground and of the highest points, metres.
+        intensity: the largest intensity except for outliers, in [0, 1].
     """
 
     about: dict[str, Any]
@@ -77,13 +79,17 @@ class Packed:
 def show(result: Segmentation, path: Path | str | None = None, open_browser: bool = True) -> Path:
     """Write a page that shows a segmented scan in 3D, open it, and return its path.
 
-    It has the labels, also of each network, uncertain points, and errors if the scan has labels.
+    The page shows the labels, the labels of each network, the uncertain points and, if the scan has
+    a ground truth, the errors.
 
     Args:
-        path: the file, NAME.html; by default in a temporary folder. An earlier page is replaced.
+        result: the result of a `Segmenter`.
+        path: the file, NAME.html, which may replace an earlier page; by default a file in a
+            temporary folder.
+        open_browser: also open the page.
 
     Raises:
-        InputError: if the file cannot be written, or is another one than a page.
+        InputError: if the file cannot be written, or holds something else than a page.
     """
     origin = result.require_origin()
     if path is not None:
@@ -111,9 +117,13 @@ def open_page(path: Path) -> None:
 def write_page(
     path: Path | str, scans: Iterable[ShownScan], taxonomy: Taxonomy, title: str
 ) -> Evaluation:
-    """Write scans, in the order of the page's slider, as one self-contained page.
+    """Write one self-contained page with some scans; the file appears whole or not at all.
 
-    The file appears whole or not at all.
+    Args:
+        path: the file, NAME.html.
+        scans: the scans, in the order of the page's slider.
+        taxonomy: the classes of the labels.
+        title: the title of the page.
 
     Returns:
         The evaluation of all labels that have a ground truth; the page shows it as a table.
@@ -134,9 +144,9 @@ def write_page(
 def pack(shown: ShownScan) -> Packed:
     """Quantise one scan: positions to int16 within the scan's extent, all other values to bytes.
 
-    The planes begin with x, y and z: for each, the low bytes and then the high bytes of the
-    differences between consecutive points. The planes of `about["planes"]` follow, with one byte
-    per point.
+    The planes begin with x, y and z. Each of them has the low bytes and then the high bytes of the
+    differences between consecutive points. The planes that `about["planes"]` names follow, with one
+    byte per point.
     """
     in_reach = shown.valid & (np.abs(shown.points[:, :3]) <= REACH).all(axis=1)
     indices = np.flatnonzero(in_reach)
@@ -186,7 +196,7 @@ def pack(shown: ShownScan) -> Packed:
 
 
 def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str, evaluation: Evaluation) -> str:
-    """Return the text of the page, in which the names of files cannot act as HTML or script."""
+    """Return the text of the page; names of files in it cannot act as HTML or script."""
     scans = []
     for index, scan in enumerate(packed):
         scans.append(f'<script type="text/plain" id="scan-{index}">{scan.planes}</script>')
@@ -200,9 +210,10 @@ def fill_page(
     """Return the text of a page with the viewer's markup, style and scripts.
 
     Args:
-        about: what the scripts need to know, as JSON.
-        scans: the elements of the scans.
-        replaced: the texts of scripts that take the place of some of `SCRIPTS`, by their names.
+        title: the title of the page.
+        about: the values that the scripts read, for JSON.
+        scans: the HTML elements of the scans.
+        replaced: the texts of scripts that replace some of `SCRIPTS`, by the name of the script.
     """
     scripts = {name: _source(name) for name in SCRIPTS} | dict(replaced or {})
     style = _source("page.css")
@@ -223,7 +234,7 @@ def fill_page(
 
 
 def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, Any]:
-    """Return what the page's scripts need to know about all scans, for its JSON."""
+    """Return what the page's scripts need to know about all scans, for the page's JSON."""
     present: set[int] = set()
     planes: set[str] = set()
     for scan in packed:
@@ -258,7 +269,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
 
 
 def drawing() -> dict[str, Any]:
-    """Return what the page's scripts need to know about the colours of any scan, for its JSON."""
+    """Return the colours that the page's scripts use for any scan, for the page's JSON."""
     return {
         "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
         "ramps": {
@@ -270,7 +281,7 @@ def drawing() -> dict[str, Any]:
 
 
 def _table(evaluation: Evaluation) -> dict[str, Any] | None:
-    """Return the page's table: a row of percentages for each class and overall, by method."""
+    """Return the page's table: by method, a percentage for each class and for all classes."""
     if not evaluation.matrices:
         return None
 
@@ -293,12 +304,12 @@ def _table(evaluation: Evaluation) -> dict[str, Any] | None:
 
 
 def _percent(share: float | None) -> float | None:
-    """Return a share as a percentage with one decimal."""
+    """Return a share as a percentage with one decimal; None stays None."""
     return None if share is None else round(100 * share, 1)
 
 
 def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
-    """Return the values of the points besides their positions, (N,) uint8 each, by name."""
+    """Return all values of the points except their positions, (N,) uint8 each, by name."""
     planes = {"intensity": _to_bytes(np.nan_to_num(shown.points[:, 3]))}
 
     if shown.truth is not None:
@@ -328,7 +339,7 @@ def _to_percent(values: np.ndarray) -> np.ndarray:
 
 
 def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middle of the points and the length of an int16 step, (3,) metres each."""
+    """Return the middle of (N, 3) points and the length of an int16 step, both (3,) in metres."""
     if not len(xyz):
         return np.zeros(3), np.ones(3)
 
@@ -340,28 +351,29 @@ def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _differences(steps: np.ndarray) -> bytes:
     """Return the differences of consecutive values, (N,) int16: all low bytes, then all high bytes.
 
-    The first value is kept, and differences are modulo 2^16. They deflate to half the size.
+    The first difference is the first value. Differences are modulo 2^16. They deflate to half the
+    size of the values.
     """
     changes = np.diff(steps.view(np.uint16), prepend=np.uint16(0)).astype("<u2")
     return changes.view(np.uint8).reshape(-1, 2).T.tobytes()
 
 
 def _ramp(name: str, start: float, end: float) -> list[list[int]]:
-    """Return `STOPS` RGB colours in 0..255 from a part of one of Matplotlib's colour maps."""
+    """Return `RAMP_STOPS` RGB colours in 0..255 from a part of one of Matplotlib's colour maps."""
     from matplotlib import colormaps
 
-    colors = colormaps[name](np.linspace(start, end, STOPS))[:, :3]
+    colors = colormaps[name](np.linspace(start, end, RAMP_STOPS))[:, :3]
     return (colors * 255).round().astype(int).tolist()
 
 
 def _source(name: str) -> str:
-    """Read one of the page's files."""
+    """Read one of the files in `page_assets`."""
     path = resources.files("amvnet.viewing") / "page_assets" / name
     return path.read_text(encoding="utf-8")
 
 
 def _hash(text: str) -> str:
-    """Return the hash by which a content security policy allows this text and no other."""
+    """Return the hash with which a content security policy allows this text and no other."""
     digest = hashlib.sha256(text.encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
 

@@ -1,4 +1,4 @@
-"""Scans to look at, with their ground truth, labels by method and uncertain points."""
+"""Prepare scans for viewing, with their ground truth, labels by method and uncertain points."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from amvnet.models.methods import geometric_mean
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import check_scan
 
-# Colours for a dark background, RGB in 0..255: the official colour of points without a class is
-# black.
+# Colours for a dark background, RGB in 0..255. Points without a class get a grey, because their
+# official colour is black.
 UNLABELLED = (128, 136, 148)
 RIGHT = (78, 92, 112)
 UNSCORED = (40, 47, 58)
@@ -36,14 +36,14 @@ class ShownScan:
         name: the scan's short name, for people.
         points: (N, 4) float32 x, y, z in metres and intensity in [0, 1].
         valid: (N,) bool, the points that have a position.
-        truth: (N,) train ids of the ground truth, or None if there is none.
-        labels: (N,) train ids by method, or by "labels" if they are from files.
-        probabilities: (N,) float32 in [0, 1], what each method gives its own label.
-        second: (N,) train ids of the class that the method of the weights finds second most
-            probable; None without weights.
-        second_probability: (N,) float32 in [0, 1], of `second`.
-        uncertain: (N,) bool, the points on which the two networks disagree; None without two
-            networks.
+        truth: (N,) train ids of the ground truth; None if there is no ground truth.
+        labels: (N,) train ids by method; the key of labels from files is "labels".
+        probabilities: (N,) float32 in [0, 1] by method, the probability of the method's own label.
+        second: (N,) train ids of the class that the segmenter's method finds second most probable;
+            None without a segmenter.
+        second_probability: (N,) float32 in [0, 1], the probability of `second`.
+        uncertain: (N,) bool, the points on which the two networks disagree (section 3.2 of the
+            paper); None without two networks.
         disagreement: (N,) float32 in [0, 1], 1 - the cosine similarity of the two networks' class
             probabilities; None without two networks.
     """
@@ -61,7 +61,12 @@ class ShownScan:
 
 
 def check_labels(labels: Path, count: int) -> None:
-    """Raise InputError if there are no labels, or one file is given for several scans."""
+    """Raise InputError if a file or folder of labels does not exist, or a file has several scans.
+
+    Args:
+        labels: a label file, or a folder of predictions.
+        count: the number of scans.
+    """
     if not labels.exists():
         raise InputError(
             f"{labels}: expected a file or a folder of labels, found none; check the path"
@@ -79,13 +84,15 @@ def show_scans(
     labels: Path | None = None,
     progress: Progress = no_progress,
 ) -> Iterator[ShownScan]:
-    """Yield scans to look at, in order; each is read and labelled when it is needed.
+    """Yield scans for viewing, in order; each is read and labelled when it is needed.
 
     Args:
+        scans: the scans.
         taxonomy: the classes of the labels.
-        segmenter: labels the scans by every method.
+        segmenter: labels the scans; the labels of its networks are shown with its own.
         labels: without a segmenter, a folder of predictions as `predict` writes them, or the label
-            file of one scan.
+            file of a single scan.
+        progress: called with the number of scans that are done, and their total.
 
     Raises:
         InputError: if a file is broken or missing.
@@ -113,10 +120,14 @@ def show_scans(
 
 
 def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
-    """Return what is shown of a scan that was segmented.
+    """Return what the page shows of a segmented scan.
 
-    These are the labels of the result, of each network, and, if there are two, of their ensemble,
-    each with its probability.
+    It shows the labels of the result, the labels of each network and, if there are two networks,
+    the labels of their ensemble, each with its probability.
+
+    Args:
+        result: the result of a `Segmenter`.
+        origin: the origin of the result.
     """
     scan = origin.scan
     valid = torch.from_numpy(scan.valid)
@@ -158,5 +169,5 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
 def _shares(scores: Tensor) -> Tensor:
     """Scale the rows of scores (P, K) of valid points as `Segmentation.probabilities` does."""
     sums = scores.sum(dim=1, keepdim=True)
-    # Two networks that are wholly sure of different classes leave no score at all.
+    # Two networks that are wholly sure of different classes leave a score of 0 for every class.
     return torch.where(sums > 0, scores / sums, torch.tensor(1 / max(scores.shape[1], 1)))

@@ -1,4 +1,4 @@
-"""Calibrate trained networks: rare classes are named less often, and the ensemble trusts BEV more.
+"""Calibrate trained networks: name rare classes less often, and let the ensemble trust BEV more.
 
     python -m amvnet.weights.calibrate WEIGHTS COUNTS OUT [--prior 0.1] [--bev 0.65]
 
@@ -20,7 +20,7 @@ import torch
 from amvnet.errors import InputError
 from amvnet.weights.file import Weights, load, save
 
-LEAST_FREQUENCY = 1e-4  # of a class, as in the class weights of the training
+LEAST_FREQUENCY = 1e-4  # the least frequency of a class, as in the training's class weights
 
 
 def calibrate(
@@ -28,18 +28,20 @@ def calibrate(
 ) -> Weights:
     """Return weights with calibrated last layers of both networks.
 
-    The class weights of the training are the inverse frequencies to the power of 1/2, so that the
-    trained networks name rare classes more often than they occur. The biases rise by a share of the
-    logarithm of the frequencies, as if the power had been 1/2 - `prior`.
+    The class weights of the training are the inverse frequencies to the power of 1/2. The trained
+    networks therefore name rare classes more often than these occur. The calibration adds a share
+    of the logarithm of the frequencies to the biases, as if the power had been 1/2 - `prior`.
 
-    RV is too sure of itself, BEV not sure enough. The scores before the softmax are multiplied, so
-    that the geometric mean of the new probabilities is RV^(1 - bev) BEV^bev of the old ones. The
-    labels of a single network stay the same.
+    The range-view network (RV) is too sure of itself, the bird's-eye-view network (BEV) is not sure
+    enough. The scores before the softmax are multiplied, so that the geometric mean of the new
+    probabilities is RV^(1 - bev) BEV^bev of the old ones. This factor does not change the labels
+    of a single network.
 
     Args:
-        counts: (K,) points of each class in the training scans.
-        prior: share of the logarithm of the class frequencies.
-        bev: weight of BEV in the ensemble, above 0 and below 1.
+        weights: trained weights with both networks.
+        counts: (K,) the number of points of each class in the training scans.
+        prior: the share of the logarithm of the class frequencies.
+        bev: the weight of BEV in the ensemble, above 0 and below 1.
 
     Raises:
         InputError: if a network is missing, the counts are of other classes, or `bev` is out of

@@ -1,6 +1,6 @@
-"""The model card of a weights file, as Markdown.
+"""Write the model card of a weights file, as Markdown.
 
-It says what the weights are, how to use them, what they were trained on and how well they score.
+The card says what the weights are, how to use them, how they were trained and how well they score.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ TITLES = {
     "polar_net": "Bird's-eye-view network",
     "point_head": "Point head",
 }
-# Columns of the table: key of the validation metric, and title.
+# The columns of the table of metrics: their titles, by the key of the validation metric.
 METRICS = {"val/miou": "mIoU", "val/miou_present": "mIoU, classes present", "val/acc": "accuracy"}
-MOST_SETTINGS = 100  # of a part's training
-LONGEST_CELL = 300  # characters
-OURS = "apache-2.0"  # licence of the built-in weights, and of the package
+MOST_SETTINGS = 100  # the most settings that the card lists of a part's training
+LONGEST_CELL = 300  # the most characters in a cell of a table
+BUILT_IN_LICENCE = "apache-2.0"  # the licence of the built-in weights
 NO_LICENCE = (
     "The file names no licence. Weights may be bound by the terms of the data that they were "
     "trained on: SemanticKITTI's and nuScenes' do not allow commercial use."
@@ -34,8 +34,9 @@ def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
     """Return the card of a weights file, without the metadata of `front_matter`.
 
     Args:
+        weights: the weights.
         name: the name by which `amvnet.load` finds the weights.
-        licence: the licence that their owner grants; None if it is not stated.
+        licence: the licence that their owner grants; None if it is not known.
     """
     abridged = reprlib.Repr()
     abridged.maxdict = 40
@@ -63,12 +64,12 @@ def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
 
 
 def _cell(text: str) -> str:
-    """Return a text that fits the cell of a table: short, and without what would end the cell."""
+    """Shorten a text and remove what would end the cell of a table."""
     return " ".join(text[:LONGEST_CELL].split()).replace("|", "\\|")
 
 
 def front_matter(weights: Weights, licence: str | None = None) -> str:
-    """Return the YAML at the top of a card, from which the hub reads its metadata."""
+    """Return the YAML at the top of a card; the hub reads its metadata from it."""
     metadata = {
         "library_name": "amvnet",
         "tags": ["lidar", "point-cloud", "semantic-segmentation", weights.taxonomy.name],
@@ -125,7 +126,7 @@ def _sizes(weights: Weights) -> str:
 def _metrics(weights: Weights) -> str:
     """Return a table of the validation metrics in percent, one row per part.
 
-    The row of a network is that network alone; the row of the head is the whole method.
+    The row of a network scores this network alone; the row of the head scores the whole method.
     """
     lines = [f"| | {' | '.join(METRICS.values())} |", "|---" * (len(METRICS) + 1) + "|"]
     for part in weights.parts:
@@ -136,4 +137,4 @@ def _metrics(weights: Weights) -> str:
             cells.append(f"{100 * value:.1f}" if isinstance(value, float) else "–")
         lines.append(f"| {' | '.join(cells)} |")
 
-    return "In percent, on the scans listed below as validated_on:\n\n" + "\n".join(lines)
+    return "In percent, on the scans that are listed below as validated_on:\n\n" + "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Networks that begin as shallower ones: weights with more residual blocks than they had."""
+"""Deepen trained networks: add residual blocks to their weights."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from amvnet.weights.file import Weights
 
 
 def deepened(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights | None:
-    """Return weights with one part of another configuration that has more residual blocks.
+    """Return weights in which one part has the residual blocks of a deeper configuration.
 
-    The parameters of the part are kept. A new block begins as a skip connection: the scale of its
-    last batch norm is 0 (Goyal et al., 2017), so that the deeper network computes what the
-    shallower one did, but for the leak of one more activation.
+    The part keeps its parameters. A new block begins as a skip connection: the scale of its last
+    batch norm is 0 (Goyal et al., 2017). The deeper network therefore computes the same as the
+    shallower one, except for the leak of one more activation.
 
     Args:
+        weights: trained weights that hold the part.
         part: "range_net" or "polar_net".
         model: the configuration with the sizes of the deeper part.
-        seed: of the other parameters of the new blocks.
+        seed: the seed of the other parameters of the new blocks.
 
     Returns:
         The weights, without a record of the part's training and metrics; None if the parts differ

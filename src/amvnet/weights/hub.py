@@ -1,4 +1,4 @@
-"""Weights from the Hugging Face hub, by name. Only safetensors are read."""
+"""Download weights from the Hugging Face hub by name; only safetensors files are read."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from amvnet.errors import InputError, import_optional, one_line_errors, shown
 
 PREFIX = "hf-hub:"
-FILE = "model.safetensors"
-# An owner, a name, or a part of a revision: no path that leads elsewhere.
-WORD = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,94}[A-Za-z0-9_])?", re.ASCII)
+WEIGHTS_FILE = "model.safetensors"
+# An owner, a name, or a part of a revision; it cannot be a path that leads elsewhere.
+NAME_PART = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,94}[A-Za-z0-9_])?", re.ASCII)
 
 
 def fetch(name: str) -> Path:
@@ -29,20 +29,22 @@ def fetch(name: str) -> Path:
     """
     repository, _, revision = name.removeprefix(PREFIX).partition("@")
     check_name(repository, name)
-    if not all(map(WORD.fullmatch, revision.split("/"))) and revision:
+    if not all(map(NAME_PART.fullmatch, revision.split("/"))) and revision:
         raise InputError(
             f"expected {PREFIX}OWNER/NAME@REVISION, found {shown(name)}; correct the revision"
         )
     hub = import_optional("huggingface_hub", "hub")
 
-    with hub_errors(name, f"check the name and the network, and that {FILE} is there"):
-        path = hub.hf_hub_download(repo_id=repository, filename=FILE, revision=revision or None)
+    with hub_errors(name, f"check the name and the network, and that {WEIGHTS_FILE} is there"):
+        path = hub.hf_hub_download(
+            repo_id=repository, filename=WEIGHTS_FILE, revision=revision or None
+        )
         return Path(path)
 
 
 def check_name(repository: str, name: str) -> None:
     """Check that a repository has the form OWNER/NAME; raise InputError with `name` if not."""
-    if repository.count("/") != 1 or not all(map(WORD.fullmatch, repository.split("/"))):
+    if repository.count("/") != 1 or not all(map(NAME_PART.fullmatch, repository.split("/"))):
         raise InputError(
             f"expected {PREFIX}OWNER/NAME of letters, digits and -_. between them, found "
             f"{shown(name)}; correct the name"
@@ -50,9 +52,14 @@ def check_name(repository: str, name: str) -> None:
 
 
 def hub_errors(name: str, advice: str) -> AbstractContextManager[None]:
-    """Turn any error of the hub's client into one line that says what to do."""
+    """Turn any error of the hub's client into one line that says what to do.
 
-    # The classes of the errors depend on the version of the client, and of its HTTP library.
+    Args:
+        name: the beginning of the line.
+        advice: the end of the line.
+    """
+
+    # The classes of the errors depend on the versions of the client and its HTTP library.
     def message(error: BaseException) -> str:
         lines = [line.strip() for line in str(error).splitlines()]
         reason = next(filter(None, lines), "no more")

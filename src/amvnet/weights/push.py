@@ -8,9 +8,9 @@ from amvnet.errors import InputError, import_optional
 from amvnet.files import temporary_folder
 from amvnet.weights.card import front_matter, model_card
 from amvnet.weights.file import Weights, load, save
-from amvnet.weights.hub import FILE, PREFIX, check_name, hub_errors
+from amvnet.weights.hub import PREFIX, WEIGHTS_FILE, check_name, hub_errors
 
-CARD = "README.md"
+CARD_FILE = "README.md"
 
 
 def push(
@@ -21,7 +21,7 @@ def push(
     *,
     overwrite: bool = False,
 ) -> str:
-    """Upload weights to the hub, with their card as README.md, from the account that is logged in.
+    """Upload weights and their card (README.md) to the hub, from the account that is logged in.
 
     Args:
         weights: trained weights, or the name or path of a weights file.
@@ -29,15 +29,15 @@ def push(
         licence: the hub's name of the licence, such as "apache-2.0" or "cc-by-nc-sa-4.0". Mind
             the terms of the data that the weights were trained on.
         private: make the repository private if it is created.
-        overwrite: replace weights and a card that the repository has; the hub keeps the earlier
-            ones in its history.
+        overwrite: replace the weights and the card of the repository; the hub keeps the earlier
+            files in its history.
 
     Returns:
         The URL of the commit.
 
     Raises:
-        InputError: if there are no such weights, the repository has some and `overwrite` is false,
-            the hub refuses them, or its client is not installed.
+        InputError: if there are no such weights, the repository has weights or a card and
+            `overwrite` is false, the hub refuses the upload, or its client is not installed.
     """
     name = name.removeprefix(PREFIX)
     check_name(name, name)
@@ -47,7 +47,7 @@ def push(
 
     advice = "check the name and the network, and log in with hf auth login"
     with hub_errors(name, advice):
-        present = [file for file in (FILE, CARD) if hub.file_exists(name, file)]
+        present = [file for file in (WEIGHTS_FILE, CARD_FILE) if hub.file_exists(name, file)]
     if present and not overwrite:
         raise InputError(
             f"{name}: expected a repository without {present[0]}, found one; push to another name, "
@@ -55,16 +55,16 @@ def push(
         )
 
     with temporary_folder() as folder:
-        save(weights, folder / FILE)
+        save(weights, folder / WEIGHTS_FILE)
         card = front_matter(weights, licence) + model_card(weights, f"{PREFIX}{name}", licence)
-        (folder / CARD).write_text(card, encoding="utf-8")
+        (folder / CARD_FILE).write_text(card, encoding="utf-8")
 
         with hub_errors(name, advice):
             hub.create_repo(repo_id=name, private=private, exist_ok=True)
             commit = hub.upload_folder(
                 repo_id=name,
                 folder_path=folder,
-                allow_patterns=[FILE, CARD],
+                allow_patterns=[WEIGHTS_FILE, CARD_FILE],
                 commit_message="AMVNet weights",
             )
 

@@ -12,11 +12,11 @@ def info(weights: str | None = None, /) -> None:
         weights: a weights file, or the name of a built-in one: its model card, in Markdown.
     """
     from amvnet.cli.tables import installation_table
-    from amvnet.weights.card import OURS, model_card
+    from amvnet.weights.card import BUILT_IN_LICENCE, model_card
     from amvnet.weights.file import built_in, load
 
     if weights is None:
         show(installation_table())
         return
-    license_id = OURS if weights in built_in() else None
+    license_id = BUILT_IN_LICENCE if weights in built_in() else None
     report_lines(model_card(load(weights), weights, license_id).rstrip())
