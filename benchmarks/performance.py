@@ -76,11 +76,11 @@ def without_parts() -> None:
 def without_joining() -> None:
     """Upsample the coarse maps and convolve them at full size."""
 
-    def joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
+    def apply_to_joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
         return block(torch.cat([upsample(coarse, fine), fine], dim=1))
 
-    amvnet.models.polar_net.joined = joined
-    amvnet.models.range_net.joined = joined
+    amvnet.models.polar_net.apply_to_joined = apply_to_joined
+    amvnet.models.range_net.apply_to_joined = apply_to_joined
 
 
 def without_sharing() -> None:

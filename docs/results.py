@@ -16,7 +16,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs/results.json"
-METHODS = ("rv", "bev", "plain", "ensemble", "amvnet")
+PRINTED_METHODS = ("rv", "bev", "plain", "ensemble", "amvnet")
 REGION = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.S)
 
 
@@ -65,9 +65,9 @@ def table(rows: list[dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        best = max(row[method] for method in METHODS if method in row)
+        best = max(row[method] for method in PRINTED_METHODS if method in row)
         cells = [row["scans"], f"`{row['weights']}`"]
-        for method in METHODS:
+        for method in PRINTED_METHODS:
             if method not in row:
                 cells.append("")
                 continue

@@ -24,7 +24,7 @@ from lidarstreets import simulate
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "docs" / "try"
-PARTS = ("*.html", "*.css", "*.js", "*/*.js")  # of SOURCE; node_modules lies deeper
+PATTERNS = ("*.html", "*.css", "*.js", "*/*.js")  # of SOURCE; node_modules lies deeper
 RUNTIME = SOURCE / "node_modules" / "onnxruntime-web" / "dist"
 RUNTIME_FILES = (  # for the CPU, and for GPUs
     "ort.wasm.min.mjs",
@@ -62,7 +62,7 @@ def on_post_build(config: Any, **_: Any) -> None:
 
 def build(out: Path) -> None:
     """Write the page and all that it needs into a folder."""
-    for pattern in PARTS:
+    for pattern in PATTERNS:
         for path in SOURCE.glob(pattern):
             copy(path, out / path.relative_to(SOURCE))
     for name in RUNTIME_FILES:

@@ -21,7 +21,7 @@ LARGEST_YAML = 50_000  # size of a YAML file, bytes; PyYAML takes a second for i
 DEEPEST_YAML = 50  # levels of nested values in a YAML file
 LONGEST_INTEGER = 40  # digits of a whole number in a YAML file
 INTEGER = "tag:yaml.org,2002:int"
-PARTS = f".{'[0-9a-f]' * 32}.part*"  # names of files that `atomic_write` has not finished
+UNFINISHED_FILES = f".{'[0-9a-f]' * 32}.part*"  # pattern of their names
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # characters that names of files must not have
 # Errors of the system that the user can avoid by naming another file.
 REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENAMETOOLONG)

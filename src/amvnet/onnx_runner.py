@@ -23,21 +23,21 @@ from amvnet.models.neighbours import nearest_others
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
 from amvnet.sensors.intensity import TrainedIntensity, check_intensity, check_quantiles, match_scan
 
-DESCRIPTION = "amvnet.json"  # in the folder of the graphs
-LONGEST_NAME = 200  # characters of the name of a graph's file
-FORMAT = 2
-POLAR = ("polar_points", "polar_pillars", "polar_map", "polar_scores")
-# The graphs that each method needs
-GRAPHS = {
+DESCRIPTION = "amvnet.json"  # name of the file that describes the graphs in its folder
+LONGEST_NAME = 200  # longest file name of a graph, characters
+FORMAT = 2  # version of the description
+POLAR_GRAPHS = ("polar_points", "polar_pillars", "polar_map", "polar_scores")
+# The graphs that each method needs.
+GRAPHS_BY_METHOD = {
     "rv": ("range_net",),
-    "bev": POLAR,
-    "ensemble": ("range_net", *POLAR),
-    "amvnet": ("range_net", *POLAR, "point_head"),
+    "bev": POLAR_GRAPHS,
+    "ensemble": ("range_net", *POLAR_GRAPHS),
+    "amvnet": ("range_net", *POLAR_GRAPHS, "point_head"),
 }
-CHANNELS = 6  # x, y, z, intensity, range, mask
-LARGEST = 10_000_000  # bytes of a description
-PART = 2048  # uncertain points that the point head classifies at a time
-TINY = np.float32(1e-12)  # keeps logarithms and quotients finite
+CHANNELS = 6  # channels of the range image: x, y, z, intensity, range, mask
+LARGEST_DESCRIPTION = 10_000_000  # largest size of amvnet.json, bytes
+HEAD_BATCH = 2048  # number of uncertain points that the point head classifies at a time
+TINY = np.float32(1e-12)  # smallest divisor
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class OnnxSegmenter:
         self.head = from_dict(PointHeadConfig, description.get("point_head", {}), source)
 
         self._graphs: dict[str, Any] = {}
-        for name in GRAPHS[self.method]:
+        for name in GRAPHS_BY_METHOD[self.method]:
             self._graphs[name] = _open_graph(folder, description["graphs"][name], providers)
         self._check_sizes(folder, len(description["classes"]) - 1)
 
@@ -149,11 +149,11 @@ class OnnxSegmenter:
     def _scores(self, scan: Scan) -> tuple[np.ndarray, np.ndarray]:
         """Return (P, K) probabilities of finite points, and (P,) bool: which are uncertain."""
         points = scan.points
-        nowhere = np.zeros(len(points), dtype=bool)
+        none_uncertain = np.zeros(len(points), dtype=bool)
         if self.method == "rv":
-            return self.score_range_view(scan), nowhere
+            return self.score_range_view(scan), none_uncertain
         if self.method == "bev":
-            return self.score_polar_view(points), nowhere
+            return self.score_polar_view(points), none_uncertain
 
         f = self.score_range_view(scan)
         g = self.score_polar_view(points)
@@ -197,8 +197,8 @@ class OnnxSegmenter:
         table = np.concatenate([f, g, points], axis=1)
 
         logits = []
-        for start in range(0, len(index), PART):
-            part = slice(start, start + PART)
+        for start in range(0, len(index), HEAD_BATCH):
+            part = slice(start, start + HEAD_BATCH)
             point = table[index[part]]
             rows = table[near[part]]
             rows[..., -4:] -= point[:, None, -4:]  # x, y, z, intensity relative to the point
@@ -367,7 +367,7 @@ def read_description(folder: Path) -> dict[str, Any]:
     path = folder / DESCRIPTION
     description = None
     try:
-        if path.stat().st_size <= LARGEST:
+        if path.stat().st_size <= LARGEST_DESCRIPTION:
             description = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         raise InputError(
@@ -377,14 +377,14 @@ def read_description(folder: Path) -> dict[str, Any]:
     if (
         not isinstance(description, dict)
         or description.get("format") != FORMAT
-        or description.get("method") not in list(GRAPHS)
+        or description.get("method") not in list(GRAPHS_BY_METHOD)
     ):
         raise InputError(
             f"{path}: expected format {FORMAT} and a known method, found others; export again"
         )
 
     graphs = description.get("graphs")
-    for name in GRAPHS[description["method"]]:
+    for name in GRAPHS_BY_METHOD[description["method"]]:
         if not isinstance(graphs, dict) or not _is_complete(graphs.get(name)):
             raise InputError(f"{path}: expected the graph {name}, found none; export again")
 

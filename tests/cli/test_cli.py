@@ -15,7 +15,7 @@ import amvnet
 from amvnet.cli.main import COMMANDS, main
 from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.sensors.lidars import SENSORS
+from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
 from amvnet.weights.file import built_in, save
@@ -429,7 +429,7 @@ def test_benchs_figures_add_up(world: Path, tmp_path: Path) -> None:
 def test_list_names_all_weights_recipes_and_sensors(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_cli("list") == (0, "")
     text = capsys.readouterr().out
-    for name in (*built_in(), *recipe_names(), *SENSORS):
+    for name in (*built_in(), *recipe_names(), *KNOWN_SENSORS):
         assert f" {name} " in text
 
 

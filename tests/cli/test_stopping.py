@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from amvnet.cli import main as command_line
-from amvnet.cli.main import COMMANDS, GOES_ON
+from amvnet.cli.main import COMMANDS, CONTINUED_WHEN_REPEATED
 from amvnet.errors import InputError, SomeBroken
 from amvnet.files import atomic_write, temporary_folder, unfinished
 from amvnet.weights.file import save
@@ -82,7 +82,7 @@ def test_the_exit_code_of_every_command(
         assert ("--resume" in error) == (
             "resume" in inspect.signature(COMMANDS[command]).parameters
         )
-        assert ("start it again" in error) == (command in GOES_ON)
+        assert ("start it again" in error) == (command in CONTINUED_WHEN_REPEATED)
 
 
 def test_the_page_has_all_exit_codes() -> None:

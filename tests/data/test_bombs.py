@@ -25,7 +25,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from fixtures.scan_writers import some_points, write_bag1, write_bag2, write_las
 
-LARGEST = 15_000_000  # bytes of a file
+LARGEST_FILE = 15_000_000  # bytes of a file
 SECONDS = 10  # of the processor
 MEMORY = 1 << 30  # bytes
 
@@ -331,7 +331,7 @@ def test_a_bomb_is_read_or_refused_soon_and_in_little_memory(name: str, tmp_path
     path = tmp_path / name
     write(path)
     files = [path] if path.is_file() else list(path.iterdir())
-    assert sum(file.stat().st_size for file in files) < LARGEST
+    assert sum(file.stat().st_size for file in files) < LARGEST_FILE
 
     process = subprocess.run(
         [sys.executable, "-c", READ, kind, str(path), str(SECONDS), str(MEMORY)],

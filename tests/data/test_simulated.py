@@ -29,7 +29,7 @@ BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
 REAL_DRIVE = simulated.drive_street
 
 
-@pytest.fixture(params=simulated.SENSORS)
+@pytest.fixture(params=simulated.CLASSES_BY_SENSOR)
 def sensor(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name

@@ -13,7 +13,7 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 NOTEBOOKS = sorted(DOCS.glob("*.ipynb"))
-LARGEST = 20_000  # bytes
+LARGEST_NOTEBOOK = 20_000  # bytes
 
 
 def cells_of(path: Path) -> list[dict[str, Any]]:
@@ -31,7 +31,7 @@ def test_there_is_a_notebook_and_the_index_links_it() -> None:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_a_notebook_is_small_and_has_no_outputs(path: Path) -> None:
-    assert path.stat().st_size < LARGEST
+    assert path.stat().st_size < LARGEST_NOTEBOOK
     ids = [cell["id"] for cell in cells_of(path)]
     assert len(set(ids)) == len(ids)
     for cell in cells_of(path):

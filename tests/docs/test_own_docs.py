@@ -19,7 +19,7 @@ from amvnet.cli.main import main
 from amvnet.data.formats.detect import ENDINGS
 from amvnet.data.formats.registry import PACKAGES
 from amvnet.inference.segmentation import Verdict
-from amvnet.sensors.lidars import SENSORS
+from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import load
 
 from fixtures.scan_writers import write_bag1, write_pcd
@@ -148,4 +148,4 @@ def test_the_share_that_is_warned_about_is_that_of_the_weights() -> None:
 def test_the_names_of_sensors_are_those_that_are_known() -> None:
     pattern = r"(?s)which states lasers and field of view: (.*?)\. "
     names = re.findall(pattern, read_page("own_sensor.md"))[0]
-    assert re.findall(r"`([\w-]+)`", names) == list(SENSORS)
+    assert re.findall(r"`([\w-]+)`", names) == list(KNOWN_SENSORS)

@@ -35,7 +35,7 @@ def test_a_page_has_the_table_of_the_file(page: str) -> None:
 
 def test_what_evaluate_prints_in_the_pages_is_in_the_file() -> None:
     known = set()
-    printed_methods = [method for method in RESULTS.METHODS if method != "plain"]
+    printed_methods = [method for method in RESULTS.PRINTED_METHODS if method != "plain"]
     for row in RESULTS.read()["rows"]:
         known.add(tuple(f"{row[method]:.1f}" for method in printed_methods))
 

@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[2]
 DRIVER = ROOT / "tests" / "fixtures" / "try_page.mjs"
 PLAYWRIGHT = ROOT / "docs" / "try" / "node_modules" / "playwright-core"
 NODE = shutil.which("node")
-PATIENCE = 1500  # seconds: five scans on a machine that does much else
+TIMEOUT = 1500  # seconds: five scans on a machine that does much else
 MEGABYTE = 1_000_000
 AGREEMENT = 0.999  # least share of the points with the labels of `onnx_runner.py`
 # With these, a browser may run threads.
@@ -59,7 +59,7 @@ pytestmark = [
     pytest.mark.skipif(
         bool(MISSING) and "CI" not in os.environ, reason=f"missing: {', '.join(MISSING)}"
     ),
-    pytest.mark.timeout(PATIENCE),
+    pytest.mark.timeout(TIMEOUT),
 ]
 
 
@@ -128,7 +128,7 @@ def drive(site: Site, cases: list[dict[str, Any]], downloads: Path) -> dict[str,
         "cases": cases,
     }
     command = [str(NODE), str(DRIVER), str(downloads), json.dumps(job)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT)
     assert done.returncode == 0, done.stderr
     return dict(json.loads(done.stdout))
 

@@ -22,7 +22,7 @@ from amvnet.cache import user_cache
 from amvnet.engines.onnx import RANGE_NET, UNET
 from amvnet.export import cache
 from amvnet.export.cache import cached_networks
-from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
+from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS_BY_METHOD
 from amvnet.weights.file import Weights
 
 from fixtures.worlds import fails, files, fresh_weights, street
@@ -44,7 +44,7 @@ class Exports:
     def __call__(self, weights: Weights, out: Path | str, int8: str | None = None) -> None:
         self.count += 1
         graphs = {}
-        for name in GRAPHS["amvnet"]:
+        for name in GRAPHS_BY_METHOD["amvnet"]:
             content = b" ".join((name.encode(), self.content))
             (Path(out) / f"{name}.onnx").write_bytes(content)
             graphs[name] = {
@@ -141,7 +141,7 @@ def test_what_is_changed_in_the_cache_is_exported_again(
     assert exports.count == 2
     assert files(user_cache()) == {
         f"onnx/{folder.name}/{each}"
-        for each in (*(f"{n}.onnx" for n in GRAPHS["amvnet"]), DESCRIPTION)
+        for each in (*(f"{n}.onnx" for n in GRAPHS_BY_METHOD["amvnet"]), DESCRIPTION)
     }
 
 

@@ -19,7 +19,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking.clusters import CELL, cluster
-from amvnet.ranking.label_errors import NEAR, Doubts, find_clusters, find_doubts, rank
+from amvnet.ranking.label_errors import NEAR, PointDoubts, find_clusters, measure_doubts, rank
 from amvnet.weights.file import save
 
 from fixtures.engines import giving, scripted
@@ -86,17 +86,21 @@ def confident(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
     return share * np.eye(19)[ids - 1] + (1 - share) / 19
 
 
-def doubts_of(points: np.ndarray, rv: np.ndarray, bev: np.ndarray, labels: np.ndarray) -> Doubts:
+def doubts_of(
+    points: np.ndarray, rv: np.ndarray, bev: np.ndarray, labels: np.ndarray
+) -> PointDoubts:
     """Return the doubts about the labels of a scan for which the two views predict these ids."""
     return doubts_by_scores(points, confident(rv), confident(bev), labels)
 
 
-def doubts_by_scores(points: np.ndarray, f: np.ndarray, g: np.ndarray, ids: np.ndarray) -> Doubts:
+def doubts_by_scores(
+    points: np.ndarray, f: np.ndarray, g: np.ndarray, ids: np.ndarray
+) -> PointDoubts:
     """Return the doubts about labels for which the two views have probabilities (N, K)."""
     points = points.copy()
     points[:, 3] = 0.5
     scan = Scan(points, ids)
-    return find_doubts(scan, scripted(WEIGHTS, giving(f[scan.valid], g[scan.valid])))
+    return measure_doubts(scan, scripted(WEIGHTS, giving(f[scan.valid], g[scan.valid])))
 
 
 def three_things() -> tuple[np.ndarray, np.ndarray]:

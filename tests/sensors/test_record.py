@@ -12,7 +12,7 @@ import pytest
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
-from amvnet.sensors.lidars import HEIGHTS, SENSORS
+from amvnet.sensors.lidars import HEIGHTS, KNOWN_SENSORS
 from amvnet.sensors.record import KEY, measure_sensor, trained_sensor
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights, load, save
@@ -109,7 +109,7 @@ def test_training_measures_height_lasers_and_field_of_view() -> None:
 def test_weights_without_a_record_have_the_sensor_of_the_table(name: str) -> None:
     sensor = trained_sensor({"range_net": {"seed": 0}}, name)
     assert sensor.height == HEIGHTS.get(name)
-    assert sensor.beams == (SENSORS[name].beams if name in SENSORS else None)
+    assert sensor.beams == (KNOWN_SENSORS[name].beams if name in KNOWN_SENSORS else None)
 
 
 def test_a_record_that_fits_the_sheet_keeps_the_lasers_of_the_sheet() -> None:

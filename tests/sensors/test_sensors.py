@@ -27,7 +27,7 @@ from amvnet.sensors.lasers import SensorGeometry, measure
 from amvnet.sensors.lidars import (
     AXES,
     HEIGHTS,
-    SENSORS,
+    KNOWN_SENSORS,
     Sensor,
     make_sensor,
     rotation_from_degrees,
@@ -306,7 +306,7 @@ COORDINATE = (
     | st.floats(-50, 50, width=32)
     | st.sampled_from([0.0, 1.0, -1.7, 1e4, 3e38])
 )
-STATED = [None, Sensor(fov_up=-40), SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]
+STATED = [None, Sensor(fov_up=-40), KNOWN_SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]
 
 
 @settings(max_examples=200, deadline=None, derandomize=True, database=None)
@@ -354,7 +354,7 @@ def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
 
     assert make_sensor(str(path), height=0.5, offset="0,0,1e-1").height == 0.5
     assert make_sensor(None, rotate="90, 0,0").rotate == (90, 0, 0)
-    assert make_sensor("vlp16") == SENSORS["vlp16"]
+    assert make_sensor("vlp16") == KNOWN_SENSORS["vlp16"]
     assert make_sensor() == Sensor()
 
 
@@ -393,7 +393,7 @@ def test_wrong_options_are_named(tmp_path: Path) -> None:
 def test_sensors_are_described_as_they_are_simulated() -> None:
     """The field of view is that of the points, seen from the origin of the coordinates."""
     for name, simulated in SIMULATED_SENSORS.items():
-        sensor = SENSORS[name]
+        sensor = KNOWN_SENSORS[name]
         ends = np.array([simulated.elevations[0], simulated.elevations[-1]])
         heights = np.interp(ends, *np.transpose(simulated.origins))
         slopes = np.tan(np.radians(ends))

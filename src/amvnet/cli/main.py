@@ -36,9 +36,12 @@ from amvnet.runtime.threads import wait_passively
 _FIRST = (demo, simulate, check, train, predict, fleet, evaluate, submit, fuse)
 _LAST = (rank, analyze, ablate, export, view, bench, list_names, info)
 COMMANDS = {function.__name__: function for function in _FIRST + _LAST}
-RESUMED = ("train", "predict", "fleet")  # commands with --resume
-GOES_ON = ("simulate", "ablate")  # commands that keep what an earlier call has done
-SHARED = ("train", "evaluate", "ablate")  # commands whose work several processes can share
+WITH_RESUME = ("train", "predict", "fleet")  # commands that have --resume
+CONTINUED_WHEN_REPEATED = (
+    "simulate",
+    "ablate",
+)  # commands that keep the results of an earlier call
+WITH_PROCESSES = ("train", "evaluate", "ablate")  # commands whose work several processes can share
 WITH_RECIPE = ("train", "ablate")  # commands whose options are also the values of a recipe
 
 # Exit codes.
@@ -61,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     wait_passively()
     try:
-        with stoppable(_last_words(arguments), exits=argv is None) as stop:
+        with stoppable(_line_when_stopped(arguments), exits=argv is None) as stop:
             try:
                 code = _run_and_explain(arguments)
             except BaseException:  # libraries turn an interruption into exceptions of their own
@@ -83,12 +86,12 @@ def _usage() -> str:
     return "\n".join([*lines, "", f"`amvnet COMMAND --help` says more. Version {__version__}."])
 
 
-def _last_words(arguments: Sequence[str]) -> str:
-    """Return what is said if the command is stopped: whether it can go on."""
+def _line_when_stopped(arguments: Sequence[str]) -> str:
+    """Return the line to print if the command is stopped; it tells how to continue."""
     command = arguments[0] if arguments else ""
-    if command in RESUMED:
+    if command in WITH_RESUME:
         return "stopped; go on with --resume"
-    if command in GOES_ON:
+    if command in CONTINUED_WHEN_REPEATED:
         return "stopped; start it again to go on"
     return "stopped"
 
@@ -133,9 +136,9 @@ def run(command: str, arguments: Sequence[str]) -> None:
             f"expected a command of amvnet, found {command!r}"
             + did_you_mean(command, COMMANDS, "see amvnet --help")
         )
-    if command not in SHARED and _has_several_processes():
+    if command not in WITH_PROCESSES and _has_several_processes():
         raise InputError(
-            f"expected one of {', '.join(SHARED)} for several processes, found {command}; "
+            f"expected one of {', '.join(WITH_PROCESSES)} for several processes, found {command}; "
             "run it in one process"
         )
 

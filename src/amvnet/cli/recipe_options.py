@@ -13,7 +13,7 @@ from amvnet.config.schema import Recipe
 from amvnet.errors import InputError
 from amvnet.files import parse_yaml
 
-PARTS = ("model", "training")  # of a recipe, whose values are options
+SECTIONS = ("model", "training")  # the sections of a recipe whose values are options
 HELP_ALL = "--help-all"
 
 
@@ -24,7 +24,7 @@ def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
         action="help",
         help="show also every value of the recipe, such as --training.rv.epochs, and exit",
     )
-    for name in PARTS:
+    for name in SECTIONS:
         for path, config in _walk(getattr(recipe, name), name):
             group: Any = parser
             if shows_all:

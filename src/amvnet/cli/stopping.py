@@ -15,7 +15,7 @@ from types import FrameType
 from amvnet.cli.console import console, report_fault, stdout
 from amvnet.files import unfinished
 
-PATIENCE = 0.6  # seconds in which a command may end by itself
+SECONDS_TO_END = 0.6  # time that a command has to end by itself, seconds
 
 
 class Stop:
@@ -49,7 +49,7 @@ class Stop:
             # An exception within the C++ code that torch runs when it is imported aborts.
             if is_second or _is_importing(frame):
                 self.end()
-            deadline = threading.Timer(PATIENCE, self._insist)
+            deadline = threading.Timer(SECONDS_TO_END, self._insist)
             deadline.daemon = True
             deadline.start()
         raise KeyboardInterrupt
@@ -58,7 +58,7 @@ class Stop:
         """End the processes that the command may be waiting for, and then this one."""
         for child in multiprocessing.active_children():
             child.kill()
-        time.sleep(PATIENCE / 3)
+        time.sleep(SECONDS_TO_END / 3)
         self.end()
 
     def end(self) -> None:

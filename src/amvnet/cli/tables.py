@@ -18,7 +18,7 @@ from amvnet.evaluation.metrics import OVERALL
 from amvnet.inference.timing import MEAN, STAGES
 from amvnet.models.methods import title_of
 from amvnet.progress import counted
-from amvnet.sensors.lidars import SENSORS
+from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import built_in, load
 from lidarstreets import SENSORS as SIMULATED_SENSORS
 
@@ -175,7 +175,7 @@ def sensors_table() -> Table:
     table.add_column("--sensor")
     for name in ("lasers", "up to", "down to"):
         table.add_column(name, justify="right")
-    for name, sensor in SENSORS.items():
+    for name, sensor in KNOWN_SENSORS.items():
         table.add_row(
             name, str(sensor.beams), f"{sensor.fov_up:+g} degrees", f"{sensor.fov_down:+g} degrees"
         )

@@ -21,7 +21,7 @@ from amvnet.files import atomic_write
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 
-NAMED = 5  # unknown ids and scans in a message
+SHOWN_PROBLEMS = 5  # most unknown ids, or scans, that a message shows
 LARGEST_MEMORY = 200_000_000  # bytes of a file of remembered contents; 20,000 scans need 5 million
 
 
@@ -137,8 +137,12 @@ class Report:
             )
         unknown = self.unknown
         if unknown:
-            texts = [describe_unknown(*item) for item in list(unknown.items())[:NAMED]]
-            more = f" and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
+            texts = [describe_unknown(*item) for item in list(unknown.items())[:SHOWN_PROBLEMS]]
+            more = (
+                f" and {len(unknown) - SHOWN_PROBLEMS} more"
+                if len(unknown) > SHOWN_PROBLEMS
+                else ""
+            )
             yield (
                 f"{self.spec}: expected ids of classes or of ignored points, found "
                 f"{', '.join(texts)}{more}; {_advice(self.taxonomy)}"

@@ -10,10 +10,10 @@ import numpy as np
 Item = TypeVar("Item")
 
 
-def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:
-    """Return at most `most` of the items, evenly spaced, including the first and the last.
+def evenly_spaced(items: Sequence[Item], limit: int) -> list[Item]:
+    """Return at most `limit` of the items, evenly spaced, including the first and the last.
 
-    If there are fewer items, return all. If `most` is 1, return the first.
+    If there are fewer items, return all. If `limit` is 1, return the first.
     """
-    indices = np.linspace(0, len(items) - 1, min(most, len(items))).astype(int)
+    indices = np.linspace(0, len(items) - 1, min(limit, len(items))).astype(int)
     return [items[index] for index in indices]

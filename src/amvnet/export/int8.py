@@ -47,13 +47,13 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
     """
     if text != SIMULATED:
         return _read(text, weights)
-    from amvnet.data.datasets.simulated import SENSORS, simulate
+    from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR, simulate
 
     sensor = weights.sensor
-    if sensor not in SENSORS:
+    if sensor not in CLASSES_BY_SENSOR:
         raise InputError(
-            f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; "
-            "give scans of this sensor to amvnet export --int8"
+            f"expected weights of {' or '.join(CLASSES_BY_SENSOR)} to simulate for, "
+            f"found {sensor!r}; give scans of this sensor to amvnet export --int8"
         )
     with temporary_folder() as folder:
         simulate(folder, sensor=sensor, sequences=MOST_SCANS, scans=1, seed=SEED)

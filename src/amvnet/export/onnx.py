@@ -26,13 +26,13 @@ from amvnet.models.methods import MethodName, check_method, widest_method
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
-from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
+from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS_BY_METHOD
 from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity, trained_intensity
 from amvnet.sensors.lasers import MEASURES
-from amvnet.sensors.lidars import SENSORS
+from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.sensors.normalise import Expectation
 from amvnet.weights.file import Weights, load
 
@@ -132,7 +132,7 @@ def export(
 
 def possible_files(out: Path) -> dict[Path, Signature]:
     """Return all files that `export` may write into a folder, with the signatures of its files."""
-    graphs = {out / f"{name}.onnx": GRAPH for name in GRAPHS["amvnet"]}
+    graphs = {out / f"{name}.onnx": GRAPH for name in GRAPHS_BY_METHOD["amvnet"]}
     return {**graphs, out / DESCRIPTION: DESCRIBED}
 
 
@@ -242,7 +242,7 @@ def _describe_intensity(trained: TrainedIntensity | None) -> dict[str, list[floa
 def describe_expectation(expected: Expectation) -> dict[str, Any]:
     """Describe the scans that some weights expect, for programs that normalise scans themselves."""
     sensor = expected.sensor
-    sheet = SENSORS.get(sensor.name)
+    sheet = KNOWN_SENSORS.get(sensor.name)
     intensity = expected.intensity
     return {
         "sensor": {
@@ -270,7 +270,7 @@ def _graphs(weights: Weights, method: MethodName) -> dict[str, Graph]:
         graphs |= _polar_graphs(model, batch, classes)
     if model.point_head is not None and method == "amvnet":
         graphs["point_head"] = _head_graph(model, batch, classes)
-    assert tuple(graphs) == GRAPHS[method]
+    assert tuple(graphs) == GRAPHS_BY_METHOD[method]
     return graphs
 
 

@@ -19,7 +19,7 @@ from pyarrow.fs import FileType
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import PARTS
+from amvnet.files import UNFINISHED_FILES
 from amvnet.fleet.manifest import NameSet
 from amvnet.fleet.storage import Place, reaching
 from amvnet.inference.journal import check_settings
@@ -153,7 +153,7 @@ class Results:
     def _remove_unfinished(self) -> None:
         """Remove the files on this machine that killed processes have not finished."""
         if self.out.local is not None:
-            for path in self.out.local.rglob(PARTS):
+            for path in self.out.local.rglob(UNFINISHED_FILES):
                 path.unlink(missing_ok=True)
 
     def _keep_done(self) -> None:

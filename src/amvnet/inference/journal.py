@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from amvnet.errors import InputError
-from amvnet.files import PARTS, atomic_write, make_folder
+from amvnet.files import UNFINISHED_FILES, atomic_write, make_folder
 from amvnet.progress import counted
 
 JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
@@ -67,7 +67,7 @@ class Journal:
             with suppress(OSError):  # some network file systems have no locks
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             (folder / JOURNAL).unlink(missing_ok=True)
-            for path in folder.rglob(PARTS):  # earlier runs did not finish these files
+            for path in folder.rglob(UNFINISHED_FILES):  # earlier runs did not finish these files
                 if path.is_file():
                     path.unlink()
 

@@ -19,7 +19,7 @@ from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.scan import Scan
 
-NAMED = 10  # the most doubtful recordings that are named, each in a line
+SHOWN_RECORDINGS = 10  # the most doubtful recordings that are named, each in a line
 # What a user can try if the labels are doubtful.
 ADVICE = (
     "check what was assumed, and try --height, --axes, --rotate or --intensity-scale, "
@@ -144,8 +144,8 @@ def report_certainty(entries: Sequence[Entry], usual: float | None, report: Repo
         return
 
     report(verdict.shares)
-    for sensor in list(doubtful)[:NAMED]:
+    for sensor in list(doubtful)[:SHOWN_RECORDINGS]:
         report(f"warning: {sensor}: {doubtful[sensor]}")
-    others = len(doubtful) - NAMED
+    others = len(doubtful) - SHOWN_RECORDINGS
     more = f"as in {others} more; " if others > 0 else ""
     report(f"warning: {more}{ADVICE}")

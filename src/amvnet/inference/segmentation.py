@@ -17,7 +17,7 @@ from amvnet.models.amvnet import Scores
 from amvnet.outputs import check_outputs
 from amvnet.scan import Scan
 
-NAMED = 3  # the most classes that the short description of a result names
+SHOWN_CLASSES = 3  # the most classes that the short description of a result names
 
 # The ratio of the odds of an uncertain point to the usual odds, above which labels are doubtful.
 # A ratio of odds suits every tau, a difference of shares does not. With weights from simulated
@@ -125,7 +125,7 @@ class Segmentation:
         """Return the most frequent classes and their shares, as text."""
         counts = np.bincount(self.labels, minlength=len(self.class_names))
         texts = []
-        for index in np.argsort(-counts, kind="stable")[:NAMED]:
+        for index in np.argsort(-counts, kind="stable")[:SHOWN_CLASSES]:
             if counts[index]:
                 texts.append(f"{counts[index] / len(self):.0%} {self.class_names[index]}")
         return ", ".join(texts)

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from amvnet.config.schema import PolarNetConfig
 from amvnet.models.layers import ConvBlock, PointLinear, linear
-from amvnet.models.upsampled_conv import joined
+from amvnet.models.upsampled_conv import apply_to_joined
 from amvnet.models.views.polar_view import FEATURES, PolarGrid
 
 PART = 8192  # points encoded at a time on a CPU, so that they fit into its cache
@@ -72,7 +72,7 @@ class PolarNet(nn.Module):
 
         for up, skip in zip(self.up, reversed(skips[:-1]), strict=True):
             first, second = up.children()
-            x = self.drop(second(joined(first, x, skip)))
+            x = self.drop(second(apply_to_joined(first, x, skip)))
         return x
 
 

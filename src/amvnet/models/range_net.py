@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from amvnet.config.schema import RangeNetConfig
 from amvnet.models.cpu_convolution import convolve
 from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
-from amvnet.models.upsampled_conv import joined
+from amvnet.models.upsampled_conv import apply_to_joined
 from amvnet.models.views.range_view import CHANNELS
 
 FIRST_DECODED = 1  # index of the first stage that the decoder uses; its width stride is 4
@@ -46,7 +46,7 @@ class RangeNet(nn.Module):
         full = self.stem_blocks(full)  # (B, stem, H, W)
         maps = self.encode(full)
         decoded = self.decode(maps[FIRST_DECODED:])  # (B, decoder, H, W / 4)
-        x = joined(self.last, decoded, full)
+        x = apply_to_joined(self.last, decoded, full)
         return convolve(x, self.scores.weight, self.scores.bias, stride=(1, 1), padding=(0, 0))
 
     def encode(self, x: Tensor) -> list[Tensor]:

@@ -9,15 +9,15 @@ from amvnet.models.cpu_convolution import convolve
 from amvnet.models.layers import RingConv2d, upsample, wrap_width
 
 
-def joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
-    """Return `block(torch.cat([upsample(coarse, fine), fine], dim=1))`, for a `ConvBlock`."""
+def apply_to_joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
+    """Apply a `ConvBlock` to `torch.cat([upsample(coarse, fine), fine], dim=1)`."""
     convolution, norm, activation = block.children()
     assert isinstance(convolution, RingConv2d)
     return activation(norm(convolve_joined(convolution, coarse, fine)))
 
 
 def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Tensor:
-    """Return `convolution(torch.cat([upsample(coarse, fine), fine], dim=1))`, for 3 x 3 kernels.
+    """Convolve `torch.cat([upsample(coarse, fine), fine], dim=1)` with 3 x 3 kernels.
 
     A convolution is linear, so that each map can be convolved alone and the results added.
     Upsampling repeats each value s times along an axis. So the 3 taps of a kernel see at most 2

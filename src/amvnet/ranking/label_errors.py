@@ -48,13 +48,13 @@ ROW = np.dtype(
         ("rv", np.uint8),  # most common train id predicted by the range view
         ("bev", np.uint8),  # most common train id predicted by the bird's-eye view
         ("label", np.uint8),  # train id of the middle point's label
-        ("kind", np.int32),  # `Doubts.kind` of its points
+        ("kind", np.int32),  # `PointDoubts.kind` of its points
     ]
 )
 
 
 @dataclass(frozen=True)
-class Doubts:
+class PointDoubts:
     """How doubtful each of the N points of a scan is.
 
     Attributes:
@@ -97,7 +97,7 @@ def rank(
         raise InputError("expected weights with both networks, found only one; train the other")
 
     def rank_scan(record: ScanRecord, scan: Scan) -> np.ndarray:
-        return find_clusters(find_doubts(check_scan(scan), segmenter))
+        return find_clusters(measure_doubts(check_scan(scan), segmenter))
 
     rows_by_scan = [np.zeros(0, dtype=ROW)]  # in case there are no scans
     for rows in stream_scans(records, dataset.read, rank_scan, segmenter.at_once, progress):
@@ -111,7 +111,7 @@ def rank(
     return clusters[np.argsort(-clusters["score"], kind="stable")]
 
 
-def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
+def measure_doubts(scan: Scan, segmenter: Segmenter) -> PointDoubts:
     """Return how doubtful each label of a scan is; raise InputError if it has no labels."""
     label = scan.labels
     if label is None:
@@ -137,7 +137,7 @@ def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
     # Each pair of train ids becomes one number.
     kind = label.astype(np.int64) * 256 + expand_to_scan(agreed_ids, valid)
     whole = _thing_sizes(xyz, label, valid)
-    return Doubts(xyz, doubt, rv=rv, bev=bev, label=label, kind=kind, whole=whole)
+    return PointDoubts(xyz, doubt, rv=rv, bev=bev, label=label, kind=kind, whole=whole)
 
 
 def _contradiction(
@@ -178,7 +178,7 @@ def _thing_sizes(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.nd
     return sizes
 
 
-def find_clusters(doubts: Doubts) -> np.ndarray:
+def find_clusters(doubts: PointDoubts) -> np.ndarray:
     """Divide the doubted points of one scan into clusters: (C,) rows of `ROW`."""
     doubted = np.flatnonzero(doubts.doubt > 0)
     group = cluster(doubts.xyz[doubted], doubts.kind[doubted])

@@ -144,15 +144,15 @@ def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> np.ndarray:
 
 
 _SHEETS = tomllib.loads((files("amvnet.sensors") / "lidars.toml").read_text(encoding="utf-8"))
-SENSORS = {name: Sensor(name, *sheet) for name, sheet in _SHEETS.items()}
+KNOWN_SENSORS = {name: Sensor(name, *sheet) for name, sheet in _SHEETS.items()}
 
 
 def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -> Sensor:
     """Return a sensor with some attributes overridden.
 
     Args:
-        sensor: a name in `SENSORS`; attributes of `Sensor`; or a YAML file with such attributes. By
-            default the sensor is unknown.
+        sensor: a name in `KNOWN_SENSORS`; attributes of `Sensor`; or a YAML file with such
+            attributes. By default the sensor is unknown.
         options: attributes of `Sensor`, which take precedence unless they are None. `rotate` and
             `offset` may be texts of three numbers separated by commas.
 
@@ -178,8 +178,8 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
 
 def _read_sensor(text: str) -> Sensor:
     """Return the sensor that a text names, or that a YAML file describes."""
-    if text in SENSORS:
-        return SENSORS[text]
+    if text in KNOWN_SENSORS:
+        return KNOWN_SENSORS[text]
 
     path = Path(text)
     if path.suffix not in (".yaml", ".yml"):
@@ -190,8 +190,8 @@ def _read_sensor(text: str) -> Sensor:
                 f"{', '.join(models)}, or give a YAML file"
             )
         raise InputError(
-            f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {shown(text)}"
-            f"{did_you_mean(text, SENSORS, 'give one of them')}"
+            f"expected a sensor of {', '.join(KNOWN_SENSORS)} or a YAML file, found {shown(text)}"
+            f"{did_you_mean(text, KNOWN_SENSORS, 'give one of them')}"
         )
 
     tree = read_yaml(path, "a description of a sensor")
@@ -206,7 +206,7 @@ def _read_sensor(text: str) -> Sensor:
 def _models_of(text: str) -> list[str]:
     """Return the known LiDARs of a maker, or those whose names begin in the same way."""
     beginnings = MAKERS.get(text.lower(), (text.lower(),))
-    return [name for name in SENSORS if text and name.startswith(beginnings)]
+    return [name for name in KNOWN_SENSORS if text and name.startswith(beginnings)]
 
 
 def _to_triple(value: Any) -> Any:

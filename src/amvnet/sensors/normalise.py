@@ -19,7 +19,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.frame import Frame
 from amvnet.sensors.intensity import IntensityMap, TrainedIntensity, intensity_map
 from amvnet.sensors.lasers import SensorGeometry, elevations
-from amvnet.sensors.lidars import SENSORS, Sensor
+from amvnet.sensors.lidars import KNOWN_SENSORS, Sensor
 from amvnet.sensors.measure import (
     MEASURED,
     Estimate,
@@ -105,7 +105,7 @@ def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expecta
     if expected.lasers.field_of_view is None or is_named or lasers.is_like(expected.lasers):
         return line
 
-    sheet = SENSORS.get(trained.name)
+    sheet = KNOWN_SENSORS.get(trained.name)
     name = trained.name if sheet and sheet.beams == trained.beams else "a sensor"
     return (
         f"{line}; the weights were trained for {name} ({describe_lasers(expected.lasers)}) "
@@ -304,7 +304,7 @@ def _rows(
     """
     ring = scan.ring if expected.view.rows == "ring" else None
     # If no data sheet describes the lasers, they may be unevenly spaced.
-    is_trusted = ring is not None and expected.sensor.name not in SENSORS
+    is_trusted = ring is not None and expected.sensor.name not in KNOWN_SENSORS
     if view is None or is_trusted:
         return None
 

@@ -15,7 +15,7 @@ from amvnet.sensors.ground import MIN_DISTANCE
 from amvnet.sensors.intensity import KEY as INTENSITY
 from amvnet.sensors.intensity import network_records
 from amvnet.sensors.lasers import MEASURES, SensorGeometry, elevations, measure
-from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
+from amvnet.sensors.lidars import HEIGHTS, KNOWN_SENSORS, Sensor
 from amvnet.sensors.normalise import Normaliser
 
 KEY = "sensor"  # key of the sensor in a part's training record
@@ -32,7 +32,7 @@ def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
         name: the name of the sensor in the weights, whose data sheet gives the values that no
             record has.
     """
-    known = dataclasses.replace(SENSORS.get(name, Sensor(name)), height=HEIGHTS.get(name))
+    known = dataclasses.replace(KNOWN_SENSORS.get(name, Sensor(name)), height=HEIGHTS.get(name))
     for record in _sensor_records(training):
         known = _with_measures(known, record)
     return known

@@ -188,10 +188,10 @@ def lasers(scan: Scan) -> np.ndarray:
     return np.searchsorted(borders, elevation, side="right")
 
 
-def _drop_points(scan: Scan, most: float, rng: np.random.Generator) -> Scan:
-    """Drop a random share of the points, up to `most`; keep all if none would be left."""
+def _drop_points(scan: Scan, largest_share: float, rng: np.random.Generator) -> Scan:
+    """Drop a random share of the points, up to `largest_share`; keep all if none would be left."""
     draws = rng.random(len(scan))
-    return _keep(scan, draws >= rng.uniform(0, most))
+    return _keep(scan, draws >= rng.uniform(0, largest_share))
 
 
 def _drop_lasers(scan: Scan, rng: np.random.Generator) -> Scan:

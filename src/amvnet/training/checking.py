@@ -16,7 +16,7 @@ from amvnet.progress import Tenths, counted
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import COUNTS
 
-NAMED = 3  # broken scans in a message
+SHOWN_SCANS = 3  # most broken scans that a message names
 
 
 def check_data(plan: Plan) -> np.ndarray:
@@ -82,7 +82,7 @@ def _refuse(checked: Report) -> None:
     broken = checked.broken
     if broken:
         total = sum(len(split.scans) + len(split.broken) for split in checked.splits.values())
-        others = list(broken)[1:NAMED]
+        others = list(broken)[1:SHOWN_SCANS]
         more = len(broken) - 1 - len(others)
         rest = f", also {', '.join(others)}" if others else ""
         rest += f" and {more} more" if more > 0 else ""

@@ -248,14 +248,14 @@ class PointGatherer:
         labels_of_scans = []
         share = processes.share(keys)
         limit = self.plan.recipe.training.head.points
-        most = -(-limit // len(keys))  # points of a scan, rounded up
+        points_per_scan = -(-limit // len(keys))  # rounded up
         scorer = self._scorer()
         tenths = Tenths()
 
         with (folder / str(processes.rank)).open("wb") as file:
             for number, key in enumerate(share, start=1):
                 points, labels, scan_matrices = self._gather_scan(
-                    scans, key, scorer, assertion, most
+                    scans, key, scorer, assertion, points_per_scan
                 )
                 points.tofile(file)
                 labels_of_scans.append(labels)
@@ -285,9 +285,9 @@ class PointGatherer:
 
     @torch.inference_mode()
     def _gather_scan(
-        self, scans: ScanSet, key: Key, scorer: Scorer, assertion: Assertion, most: int
+        self, scans: ScanSet, key: Key, scorer: Scorer, assertion: Assertion, points_per_scan: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Score one scan, and draw at most `most` of its uncertain points.
+        """Score one scan, and draw at most `points_per_scan` of its uncertain points.
 
         Returns:
             (U,) points, their (U,) uint8 train ids, and the (2, K + 1, K + 1) confusion matrices
@@ -311,7 +311,7 @@ class PointGatherer:
 
         candidates = uncertain.nonzero()[:, 0]
         rng = np.random.default_rng(seeds)
-        drawn = np.sort(rng.permutation(len(candidates))[:most])
+        drawn = np.sort(rng.permutation(len(candidates))[:points_per_scan])
         index = candidates[torch.from_numpy(drawn).to(device)]
 
         config = self.weights.model.point_head

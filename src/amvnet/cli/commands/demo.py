@@ -25,7 +25,7 @@ def demo(
         overwrite: replace the page and the figures if they exist.
     """
     from amvnet import load
-    from amvnet.data.datasets.simulated import SENSORS, simulate
+    from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR, simulate
     from amvnet.errors import InputError
     from amvnet.evaluation.metrics import REPORT
     from amvnet.inference.listing import list_inputs
@@ -38,7 +38,7 @@ def demo(
     check_outputs({page: PAGE, metrics_path: REPORT}, [weights], overwrite)
     segmenter = load(weights)
     classes = segmenter.taxonomy.classes
-    sensors = [name for name, taxonomy in SENSORS.items() if taxonomy.classes == classes]
+    sensors = [name for name, taxonomy in CLASSES_BY_SENSOR.items() if taxonomy.classes == classes]
     if not sensors:
         raise InputError(
             f"--weights {weights}: expected the classes of SemanticKITTI or nuScenes, which "

@@ -10,7 +10,7 @@ from amvnet.data.datasets.description import ENDINGS, is_description
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
-from amvnet.data.datasets.simulated import SENSORS, SimulatedStreets
+from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR, SimulatedStreets
 from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
 
@@ -18,7 +18,9 @@ Reader = type[SemanticKitti] | type[NuScenes]
 
 READERS: dict[str, Reader] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
 OWN = "files"  # prefix of the YAML file of a user's own scans
-SIMULATED = {f"simulated-{sensor}": sensor for sensor in SENSORS}  # names of sensors by prefix
+SIMULATED = {
+    f"simulated-{sensor}": sensor for sensor in CLASSES_BY_SENSOR
+}  # names of sensors by prefix
 
 
 def open_dataset(spec: str) -> Dataset:

@@ -25,8 +25,8 @@ from amvnet.scan import Scan
 from lidarstreets import SimulationError, drive_street
 from lidarstreets import simulate as simulate_streets
 
-# The classes of the files that each sensor of the simulator writes.
-SENSORS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
+# The classes in the files that the simulator writes for each sensor.
+CLASSES_BY_SENSOR = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
 SCANS = 6  # of a street
 TRAIN_STREETS = {"hdl64e": 140, "hdl32e": 84}
 VAL_STREETS = 6
@@ -55,13 +55,13 @@ class SimulatedStreets(Dataset):
 
     Args:
         root: the folder of the cache; made if there is none.
-        sensor: the name of a sensor in `SENSORS`, whose benchmark has the classes.
+        sensor: the name of a sensor in `CLASSES_BY_SENSOR`, whose benchmark has the classes.
     """
 
     readers = 1  # two would simulate the same street
 
     def __init__(self, root: Path | str, sensor: str = "hdl64e") -> None:
-        super().__init__(root, SENSORS[sensor], f"simulated-{sensor}:{root}")
+        super().__init__(root, CLASSES_BY_SENSOR[sensor], f"simulated-{sensor}:{root}")
         self.sensor = sensor
 
     def official(self, split: str) -> tuple[str, ...]:
@@ -123,7 +123,7 @@ class SimulatedStreets(Dataset):
 
     @property
     def _is_nuscenes(self) -> bool:
-        return SENSORS[self.sensor] is NUSCENES
+        return CLASSES_BY_SENSOR[self.sensor] is NUSCENES
 
     def _number(self, sequence: str) -> int:
         if not re.fullmatch("[0-9]{1,9}", sequence) or int(sequence) > LAST_STREET:

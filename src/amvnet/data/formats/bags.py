@@ -128,16 +128,16 @@ def _check_unpacked(folder: Path) -> None:
     """
     from rosbags.rosbag2.reader import zstd
 
-    most = DISK + DISK_PER_BYTE * size_of(folder)
+    limit = DISK + DISK_PER_BYTE * size_of(folder)
 
     unpacked = 0
     for path in sorted(folder.glob("*.zstd")):
         with zstd.open(path, "rb") as file:
             while chunk := file.read(CHUNK):
                 unpacked += len(chunk)
-                if unpacked > most:
+                if unpacked > limit:
                     raise InputError(
-                        f"{folder}: expected at most {most >> 20} MB of unpacked files, found "
+                        f"{folder}: expected at most {limit >> 20} MB of unpacked files, found "
                         f"more; {ADVICE}"
                     )
 

@@ -102,6 +102,6 @@ def _unpack(packed: IO[bytes] | gzip.GzipFile, path: Path, title: str) -> None:
         while chunk := packed.read(CHUNK):
             size += len(chunk)
             if size > MAX_BYTES:
-                most = MAX_BYTES >> 20
-                raise InputError(f"{title}: expected at most {most} MB, found more; {ADVICE}")
+                limit = MAX_BYTES >> 20
+                raise InputError(f"{title}: expected at most {limit} MB, found more; {ADVICE}")
             file.write(chunk)

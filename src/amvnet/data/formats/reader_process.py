@@ -210,11 +210,11 @@ def _set_limits(size: int) -> None:
 
 
 def _limit(kind: int, value: int) -> None:
-    _, most = resource.getrlimit(kind)
-    if most != resource.RLIM_INFINITY:
-        value = min(value, most)
+    _, hard_limit = resource.getrlimit(kind)
+    if hard_limit != resource.RLIM_INFINITY:
+        value = min(value, hard_limit)
     with suppress(ValueError, OSError):  # some systems refuse it
-        resource.setrlimit(kind, (value, most))
+        resource.setrlimit(kind, (value, hard_limit))
 
 
 def _send(replies: BinaryIO, values: dict[str, Any]) -> None:

@@ -22,7 +22,7 @@ INTEGERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.int64}
 COLUMNS = ("class", "label", "scalar_class", "scalar_label")  # scalar_*: from CloudCompare
 ARRAYS = ("labels", "label", "class", "arr_0")  # of an archive
 KEY = "labels"  # key of the labels among the columns that a reader returns
-LARGEST = np.iinfo(np.uint32).max
+LARGEST_ID = np.iinfo(np.uint32).max
 ADVICE = "write the labels again, one whole number per point"
 
 
@@ -139,7 +139,7 @@ def _check(labels: np.ndarray, path: Path, count: int) -> np.ndarray:
             f"{path}: expected whole numbers as labels, found {labels[is_wrong][0]:g} "
             f"({np.count_nonzero(is_wrong):,} of {count:,} labels are not whole); {ADVICE}"
         )
-    if count and not -LARGEST <= labels.min() <= labels.max() <= LARGEST:
+    if count and not -LARGEST_ID <= labels.min() <= labels.max() <= LARGEST_ID:
         raise InputError(f"{path}: expected labels of 32 bits, found larger ones; {ADVICE}")
     return labels.astype(np.int64)
 
