@@ -35,8 +35,9 @@ from amvnet.scan import Scan
 from amvnet.weights.file import save
 from lidarstreets.layouts import write_whole
 
+from fixtures.commands import fails, refusal, run_cli
 from fixtures.datasets import MAKERS, make_nuscenes
-from fixtures.worlds import fails, fresh_weights, refusal, run_cli, street, write_recipe
+from fixtures.tiny import fresh_weights, street, write_recipe
 
 COUNT = 7  # points of a scan
 PRECIOUS = b"hours of work"

@@ -18,16 +18,14 @@ from amvnet.onnx_runner import DESCRIPTION
 from amvnet.outputs import Signature, check_outputs
 from amvnet.weights.file import save
 
-from fixtures.worlds import (
+from fixtures.commands import (
     fails,
     files,
-    fresh_weights,
-    make_streets,
     refusal,
     run_cli,
-    street,
     succeed,
 )
+from fixtures.tiny import fresh_weights, make_streets, street
 
 MINE = b"hours of work"
 ANYTHING = Signature("a file", b"")

@@ -23,8 +23,14 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import read_page
+from fixtures.commands import fails, files, succeed
 from fixtures.scan_writers import write_bag1, write_pcd
-from fixtures.worlds import fails, files, fresh_weights, make_streets, street, succeed, without
+from fixtures.tiny import (
+    fresh_weights,
+    make_streets,
+    street,
+    without,
+)
 
 WEIGHTS = fresh_weights()
 POINTS = np.clip(street(3, 500)[0], -60, 60)

@@ -20,15 +20,17 @@ from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
 from amvnet.weights.file import built_in, save
 
-from fixtures.worlds import (
-    GOLDEN,
+from fixtures.commands import (
     files,
-    fresh_weights,
-    make_streets,
     refusal,
     run_cli,
-    street,
     succeed,
+)
+from fixtures.tiny import (
+    GOLDEN,
+    fresh_weights,
+    make_streets,
+    street,
     without,
     write_recipe,
 )

@@ -19,7 +19,7 @@ from amvnet.cli import console
 from amvnet.progress import QUIET_SECONDS
 from amvnet.weights.file import save
 
-from fixtures.worlds import fresh_weights, street
+from fixtures.tiny import fresh_weights, street
 
 PROGRESS_LINE = r"segmenting: (\d+) of \d+, .*, \d+:\d\d:\d\d left"
 

@@ -14,7 +14,7 @@ from amvnet.cli.parser import field_texts, make_parser, run_with
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
 from amvnet.config.schema import ModelConfig, Recipe
 
-from fixtures.worlds import refusal, run_cli
+from fixtures.commands import refusal, run_cli
 
 TRAIN = "train simulated-compact --data x --out o"
 HUGE = "9" * 9000

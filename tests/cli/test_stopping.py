@@ -20,8 +20,9 @@ from amvnet.errors import InputError, SomeBroken
 from amvnet.files import atomic_write, temporary_folder, unfinished
 from amvnet.weights.file import save
 
+from fixtures.commands import run_cli
 from fixtures.scan_writers import some_points, write_las
-from fixtures.worlds import fresh_weights, run_cli, street
+from fixtures.tiny import fresh_weights, street
 
 SOON = 5  # seconds on a busy machine; a second on an idle one
 

@@ -19,7 +19,7 @@ from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.config.schema import ModelConfig, PointHeadConfig, Recipe
 from amvnet.errors import InputError
 
-from fixtures.worlds import run_cli
+from fixtures.commands import run_cli
 
 
 def write_recipe(folder: Path, text: str) -> str:

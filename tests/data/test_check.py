@@ -14,9 +14,10 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.taxonomy import UNKNOWN
 
+from fixtures.commands import run_cli, succeed
 from fixtures.datasets import MAKERS
 from fixtures.scan_writers import some_points
-from fixtures.worlds import make_streets, run_cli, succeed, write_recipe
+from fixtures.tiny import make_streets, write_recipe
 
 SITES = ("a", "b", "c")  # c validates
 RAW = np.random.default_rng(1).choice([3, 7, 40], 60)

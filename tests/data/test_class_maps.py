@@ -14,14 +14,8 @@ from amvnet.data.class_maps import class_map
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.weights.file import save
 
-from fixtures.worlds import (
-    GOLDEN,
-    fails,
-    fresh_weights,
-    make_streets,
-    refusal,
-    run_cli,
-)
+from fixtures.commands import fails, refusal, run_cli
+from fixtures.tiny import GOLDEN, fresh_weights, make_streets
 
 EQUAL = {  # classes of SemanticKITTI and of nuScenes that are the same coarse class
     "car": "car",

@@ -18,8 +18,9 @@ from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.datasets.select import split_records
 from amvnet.data.taxonomy import SEMANTICKITTI
 
+from fixtures.commands import fails
 from fixtures.datasets import COUNTS, MAKERS, Layout, make_nuscenes, make_semantickitti
-from fixtures.worlds import fails, make_streets
+from fixtures.tiny import make_streets
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 

@@ -21,8 +21,9 @@ from amvnet.errors import InputError
 from amvnet.files import fault_of_name
 from amvnet.weights.file import save
 
+from fixtures.commands import fails, files, run_cli
 from fixtures.scan_writers import WRITERS, some_points, write_sweep
-from fixtures.worlds import fails, files, fresh_weights, run_cli, street
+from fixtures.tiny import fresh_weights, street
 
 PACKETS = "uint8[] data\n"
 

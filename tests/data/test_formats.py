@@ -31,6 +31,7 @@ from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 
+from fixtures.commands import fails
 from fixtures.scan_writers import (
     FLOATS,
     WRITERS,
@@ -41,7 +42,6 @@ from fixtures.scan_writers import (
     write_bag2,
     write_las,
 )
-from fixtures.worlds import fails
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 LAS_STEP = 0.0006  # metres: the LAS files have millimetres

@@ -17,8 +17,8 @@ from amvnet.data.datasets.select import split_records, training_records
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 
+from fixtures.commands import fails, run_cli
 from fixtures.scan_writers import some_points, write_las, write_ply
-from fixtures.worlds import fails, run_cli
 
 RAW = np.random.default_rng(1).choice([3, 7, 40], 60)
 EXPECTED = np.select([RAW == 3, RAW == 7], [1, 2], 0)  # 40 is ignored

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fixtures.worlds import GOLDEN, run_cli
+from fixtures.commands import run_cli
+from fixtures.tiny import GOLDEN
 
 
 @dataclass

@@ -19,8 +19,8 @@ from amvnet import read as read_scan
 from amvnet.data.formats import reader_process
 from amvnet.data.formats.find import list_scans
 
+from fixtures.commands import fails
 from fixtures.scan_writers import some_points, write_bag2, write_las
-from fixtures.worlds import fails
 
 CLOUDS = [some_points(60, seed) for seed in range(6)]
 

@@ -12,8 +12,8 @@ from amvnet.data.formats.find import find_scans, list_scans, read_cloud
 from amvnet.data.formats.rows import RowLayout, are_rings, parse_layout
 from amvnet.data.formats.text import find_table
 
+from fixtures.commands import fails
 from fixtures.sensors import LASERS, place
-from fixtures.worlds import fails
 
 TIME = 1.6e9  # seconds, of the first point
 

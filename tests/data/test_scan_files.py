@@ -15,7 +15,7 @@ from amvnet.data.labels.ids import write_ids
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy
 from amvnet.files import atomic_write, read_yaml
 
-from fixtures.worlds import fails
+from fixtures.commands import fails
 
 # --- single files ---
 

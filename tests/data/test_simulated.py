@@ -23,7 +23,8 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, simulate
 
-from fixtures.worlds import fails, fake_drive
+from fixtures.commands import fails
+from fixtures.tiny import fake_drive
 
 BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
 REAL_DRIVE = simulated.drive_street

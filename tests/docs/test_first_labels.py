@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fixtures.worlds import commands_of, run_cli
+from fixtures.commands import commands_of, run_cli
 
 PAGE = "docs/first_labels.md"
 

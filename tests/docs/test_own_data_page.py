@@ -12,8 +12,9 @@ import pytest
 from amvnet.weights.file import load, save
 from lidarstreets import SENSORS
 
+from fixtures.commands import commands_of, run_cli
 from fixtures.own_scans import CLASSES, make_own_scans
-from fixtures.worlds import commands_of, fresh_weights, run_cli, write_recipe
+from fixtures.tiny import fresh_weights, write_recipe
 
 PAGE = "docs/own_data.md"
 ONE_EPOCH = {"rv": {"epochs": 1}, "bev": {"epochs": 1}, "head": {"epochs": 1}}

@@ -22,9 +22,9 @@ from amvnet.inference.segmentation import Verdict
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import load
 
+from fixtures.commands import files, succeed
 from fixtures.scan_writers import write_bag1, write_pcd
 from fixtures.sensors import LASERS, place
-from fixtures.worlds import files, succeed
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = ("own_scans.md", "own_sensor.md")

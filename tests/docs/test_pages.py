@@ -15,7 +15,7 @@ from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
 from amvnet.models.methods import EngineName
 
-from fixtures.worlds import commands_of
+from fixtures.commands import commands_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))

@@ -13,7 +13,8 @@ import pytest
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.weights.file import save
 
-from fixtures.worlds import commands_of, fresh_weights, make_streets, succeed
+from fixtures.commands import commands_of, succeed
+from fixtures.tiny import fresh_weights, make_streets
 
 PAGE = "docs/peers.md"
 WEIGHTS = "w.safetensors"

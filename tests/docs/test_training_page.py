@@ -16,14 +16,12 @@ import pytest
 from amvnet.config.recipes import recipe_names
 from amvnet.weights.file import load, save
 
+from fixtures.commands import commands_of, files, run_cli
 from fixtures.scan_writers import write_pcd
-from fixtures.worlds import (
+from fixtures.tiny import (
     GOLDEN,
-    commands_of,
-    files,
     fresh_weights,
     make_streets,
-    run_cli,
     write_recipe,
 )
 

@@ -38,10 +38,16 @@ from amvnet.models.views.points import PointBatch
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
+from fixtures.commands import (
+    commands_of,
+    fails,
+    files,
+    run_cli,
+)
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.engines import ScriptedEngine, sure_of
 from fixtures.networks import whole_model
-from fixtures.worlds import commands_of, fails, files, fresh_weights, make_streets, run_cli, street
+from fixtures.tiny import fresh_weights, make_streets, street
 
 N = 15
 no_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")

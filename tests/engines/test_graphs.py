@@ -29,7 +29,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 
 from fixtures.networks import POLAR_NET, K, build_range
-from fixtures.worlds import fresh_weights, street
+from fixtures.tiny import fresh_weights, street
 
 WEIGHTS = fresh_weights()
 

@@ -22,7 +22,8 @@ from amvnet.inference.scan_stream import stream_scans
 from amvnet.models.methods import MethodName
 from amvnet.weights.file import load
 
-from fixtures.worlds import fails, files, fresh_weights
+from fixtures.commands import fails, files
+from fixtures.tiny import fresh_weights
 
 TENSORRT = "TensorrtExecutionProvider"
 CUDA = "CUDAExecutionProvider"

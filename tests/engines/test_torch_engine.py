@@ -28,7 +28,7 @@ from amvnet.weights.file import Weights
 from lidarstreets import simulate
 
 from fixtures.engines import scripted, sure_of
-from fixtures.worlds import fresh_weights, street
+from fixtures.tiny import fresh_weights, street
 
 PART = 2000  # uncertain points that the plain model classifies at a time
 

@@ -30,13 +30,11 @@ from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES
 from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.worlds import (
-    files,
+from fixtures.commands import files, refusal, succeed
+from fixtures.tiny import (
     fresh_weights,
     make_streets,
-    refusal,
     street,
-    succeed,
     without,
     write_recipe,
     write_scan,

@@ -25,7 +25,8 @@ from amvnet.export.cache import cached_networks
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS_BY_METHOD
 from amvnet.weights.file import Weights
 
-from fixtures.worlds import fails, files, fresh_weights, street
+from fixtures.commands import fails, files
+from fixtures.tiny import fresh_weights, street
 
 WEIGHTS = fresh_weights()
 

@@ -25,7 +25,8 @@ from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights, save
 
-from fixtures.worlds import fails, files, fresh_weights, street, succeed, without
+from fixtures.commands import fails, files, succeed
+from fixtures.tiny import fresh_weights, street, without
 
 POINTS = 3000
 QUANTISED = ("range_net", "polar_map")

@@ -33,17 +33,15 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES, QUANTILES
 from amvnet.weights.file import Weights, save
 
-from fixtures.worlds import (
+from fixtures.commands import (
     commands_of,
     fails,
     files,
-    fresh_weights,
     refusal,
     run_cli,
-    street,
     succeed,
-    without,
 )
+from fixtures.tiny import fresh_weights, street, without
 
 PROJECT = Path(__file__).parents[2]
 POINTS = 6000

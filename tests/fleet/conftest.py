@@ -13,7 +13,8 @@ import pytest
 
 from amvnet.weights.file import save
 
-from fixtures.worlds import fresh_weights, street, succeed
+from fixtures.commands import succeed
+from fixtures.tiny import fresh_weights, street
 
 # They are not among the packages of `make test`.
 HAS_PACKAGES = all(find_spec(name) for name in ("pyarrow", "moto", "boto3"))

@@ -24,9 +24,10 @@ from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation
 from amvnet.weights.file import load
 
+from fixtures.commands import fails, succeed
 from fixtures.s3_server import Bucket
 from fixtures.scan_writers import write_ply
-from fixtures.worlds import fails, street, succeed
+from fixtures.tiny import street
 
 NOWHERE = Place.of("/an/output/folder/elsewhere")
 

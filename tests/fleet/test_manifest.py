@@ -21,8 +21,8 @@ from amvnet.fleet import manifest
 from amvnet.fleet.manifest import NameSet, list_scans, split_name
 from amvnet.fleet.storage import Place
 
+from fixtures.commands import fails
 from fixtures.s3_server import Bucket
-from fixtures.worlds import fails
 
 NOWHERE = "/an/output/folder/elsewhere"
 

@@ -28,8 +28,9 @@ from amvnet.fleet.storage import Place  # noqa: E402
 from amvnet.inference.request import LabellingRequest  # noqa: E402
 from amvnet.weights.file import load, save  # noqa: E402
 
+from fixtures.commands import fails, refusal, run_cli  # noqa: E402
 from fixtures.s3_server import Bucket, slow_labels  # noqa: E402
-from fixtures.worlds import fails, fresh_weights, refusal, run_cli  # noqa: E402
+from fixtures.tiny import fresh_weights  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

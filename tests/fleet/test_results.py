@@ -31,8 +31,9 @@ from amvnet.sensors.frame import Frame
 from amvnet.sensors.lasers import SensorGeometry
 from amvnet.sensors.measure import Estimate
 
+from fixtures.commands import fails
 from fixtures.s3_server import Bucket
-from fixtures.worlds import fails, fresh_weights
+from fixtures.tiny import fresh_weights
 
 REQUEST = LabellingRequest(fresh_weights())
 

@@ -29,8 +29,14 @@ from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import save
 from amvnet_ros.segmentation import CloudSegmenter, Settings
 
+from fixtures.commands import fails, succeed
 from fixtures.scan_writers import cloud_message
-from fixtures.worlds import fails, fresh_weights, street, succeed, without, write_scan
+from fixtures.tiny import (
+    fresh_weights,
+    street,
+    without,
+    write_scan,
+)
 
 WEIGHTS = fresh_weights()
 OWN = """\

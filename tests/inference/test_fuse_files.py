@@ -19,12 +19,10 @@ from amvnet import fuse
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.weights.file import load, save
 
-from fixtures.worlds import (
-    commands_of,
-    files,
+from fixtures.commands import commands_of, files, run_cli
+from fixtures.tiny import (
     fresh_weights,
     make_streets,
-    run_cli,
     street,
     without,
     write_recipe,

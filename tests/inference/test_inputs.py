@@ -24,8 +24,15 @@ from amvnet.sensors.measure import MEASURED
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import Weights, save
 
+from fixtures.commands import (
+    fails,
+    files,
+    refusal,
+    run_cli,
+    succeed,
+)
 from fixtures.sensors import LASERS, place
-from fixtures.worlds import fails, files, fresh_weights, refusal, run_cli, street, succeed
+from fixtures.tiny import fresh_weights, street
 
 
 def weights_for(sensor: str = "hdl64e") -> Weights:

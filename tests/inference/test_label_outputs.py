@@ -19,8 +19,9 @@ from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.weights.file import save
 
+from fixtures.commands import fails, files, run_cli
 from fixtures.scan_writers import some_points, write_bag1, write_pcd
-from fixtures.worlds import fails, files, fresh_weights, make_streets, run_cli
+from fixtures.tiny import fresh_weights, make_streets
 
 COUNT = 60
 LOST = 7  # the index of a point with NaN

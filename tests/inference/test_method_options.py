@@ -13,7 +13,13 @@ import amvnet
 from amvnet.config.schema import AssertionConfig
 from amvnet.weights.file import save
 
-from fixtures.worlds import fresh_weights, make_streets, refusal, street, succeed, write_scan
+from fixtures.commands import refusal, succeed
+from fixtures.tiny import (
+    fresh_weights,
+    make_streets,
+    street,
+    write_scan,
+)
 
 POINTS = street(5, 600)[0]
 FRESH = fresh_weights()

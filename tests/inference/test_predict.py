@@ -33,19 +33,17 @@ from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
+from fixtures.commands import (
+    fails,
+    files,
+    refusal,
+    run_cli,
+    succeed,
+)
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.datasets import MAKERS
 from fixtures.scan_writers import WRITERS, some_points
-from fixtures.worlds import (
-    fails,
-    files,
-    fresh_weights,
-    make_streets,
-    refusal,
-    run_cli,
-    street,
-    succeed,
-)
+from fixtures.tiny import fresh_weights, make_streets, street
 
 WEIGHTS = "w.safetensors"
 SCANS = 12

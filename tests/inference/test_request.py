@@ -13,7 +13,8 @@ from amvnet.data.formats.rows import parse_layout
 from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.lidars import Sensor
 
-from fixtures.worlds import fails, fresh_weights
+from fixtures.commands import fails
+from fixtures.tiny import fresh_weights
 
 OTHERS: dict[str, Any] = {
     "weights": fresh_weights(seed=1),

@@ -26,7 +26,8 @@ from amvnet.runtime.memory import available_memory
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import save
 
-from fixtures.worlds import fresh_weights, make_streets, refusal, run_cli
+from fixtures.commands import refusal, run_cli
+from fixtures.tiny import fresh_weights, make_streets
 
 WAIT = 30  # seconds until a thread gives up waiting for another
 

@@ -19,7 +19,13 @@ from amvnet.evaluation.scoring import labels_by_method
 from amvnet.models.methods import METHODS, MethodName
 from amvnet.weights.file import Weights, save
 
-from fixtures.worlds import THRESHOLD, fails, fresh_weights, street, without
+from fixtures.commands import fails
+from fixtures.tiny import (
+    THRESHOLD,
+    fresh_weights,
+    street,
+    without,
+)
 
 K = 19
 POINTS = street(5, 600)[0]

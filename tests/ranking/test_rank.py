@@ -22,8 +22,9 @@ from amvnet.ranking.clusters import CELL, cluster
 from amvnet.ranking.label_errors import NEAR, PointDoubts, find_clusters, measure_doubts, rank
 from amvnet.weights.file import save
 
+from fixtures.commands import files, run_cli
 from fixtures.engines import giving, scripted
-from fixtures.worlds import files, fresh_weights, make_streets, run_cli, without
+from fixtures.tiny import fresh_weights, make_streets, without
 
 DOCS = Path(__file__).parents[2] / "docs"
 WEIGHTS = fresh_weights()

@@ -21,9 +21,10 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.torch import TorchEngine
 from amvnet.weights.file import save
 
+from fixtures.commands import succeed
 from fixtures.ros import STORE, FakeNode, install, over_the_wire
 from fixtures.scan_writers import cloud_message, write_bag2
-from fixtures.worlds import fresh_weights, street, succeed
+from fixtures.tiny import fresh_weights, street
 
 WAIT = 60.0  # seconds: much more than needed, on a busy machine too
 RECORD = np.dtype(

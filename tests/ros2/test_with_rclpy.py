@@ -14,7 +14,7 @@ import pytest
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.weights.file import save
 
-from fixtures.worlds import fresh_weights, street
+from fixtures.tiny import fresh_weights, street
 
 rclpy = pytest.importorskip("rclpy")
 WAIT = 60.0  # seconds: much more than needed, on a busy machine too

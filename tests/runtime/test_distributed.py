@@ -21,7 +21,8 @@ from amvnet.training.loaders import EpochSampler, ScanSet, make_loader
 from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.worlds import files, make_streets, run_cli, without, write_recipe
+from fixtures.commands import files, run_cli
+from fixtures.tiny import make_streets, without, write_recipe
 
 # No DropBlock, as each process draws its own blocks. Double precision, as AdamW divides each
 # gradient by its size, which turns the rounding of a tiny gradient into a full step.

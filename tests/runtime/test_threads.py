@@ -21,7 +21,7 @@ from amvnet.models import point_head, polar_net
 from amvnet.runtime.threads import WAITING, run_parts
 from amvnet.weights.file import save
 
-from fixtures.worlds import fresh_weights, street
+from fixtures.tiny import fresh_weights, street
 
 # Segments with two threads, and again in a forked pool.
 FORKING = """

@@ -15,8 +15,9 @@ from amvnet.sensors.frame import find_frame
 from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
 
+from fixtures.commands import fails
 from fixtures.sensors import LASERS, place
-from fixtures.worlds import fails, fresh_weights
+from fixtures.tiny import fresh_weights
 
 UP = ["z-down", "z-forward", "y-up"]
 

@@ -31,8 +31,14 @@ from amvnet.sensors.measure import MEASURED, Recording
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights
 
+from fixtures.commands import fails
 from fixtures.sensors import LASERS, ground_height, place
-from fixtures.worlds import fails, fresh_weights, make_streets, street, write_scan
+from fixtures.tiny import (
+    fresh_weights,
+    make_streets,
+    street,
+    write_scan,
+)
 
 TRAINED = np.array(QUANTILES["hdl64e"])
 

@@ -17,8 +17,9 @@ from amvnet.sensors.record import KEY, measure_sensor, trained_sensor
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights, load, save
 
+from fixtures.commands import run_cli
 from fixtures.scan_writers import write_bag1
-from fixtures.worlds import fresh_weights, run_cli, street, write_scan
+from fixtures.tiny import fresh_weights, street, write_scan
 
 SCANS = 3
 

@@ -37,9 +37,10 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import save
 from lidarstreets.sensing.sensors import SENSORS as SIMULATED_SENSORS
 
+from fixtures.commands import fails, files, run_cli
 from fixtures.scan_writers import pcd_bytes, write_bag1
 from fixtures.sensors import LASERS, ground_height, place
-from fixtures.worlds import fails, files, fresh_weights, make_streets, run_cli
+from fixtures.tiny import fresh_weights, make_streets
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 

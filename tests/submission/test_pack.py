@@ -16,15 +16,17 @@ from amvnet.submission import pack as submission
 from amvnet.submission.rules import rules_for
 from amvnet.weights.file import save
 
-from fixtures.datasets import make_nuscenes
-from fixtures.submissions import TEST, Case, Entries, measured, read_entries, write_files
-from fixtures.worlds import (
-    GOLDEN,
+from fixtures.commands import (
     commands_of,
     fails,
     files,
-    fresh_weights,
     run_cli,
+)
+from fixtures.datasets import make_nuscenes
+from fixtures.submissions import TEST, Case, Entries, measured, read_entries, write_files
+from fixtures.tiny import (
+    GOLDEN,
+    fresh_weights,
     street,
     write_scan,
 )

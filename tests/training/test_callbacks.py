@@ -14,7 +14,7 @@ from torch import nn
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
 from amvnet.weights.file import load
 
-from fixtures.worlds import fresh_weights
+from fixtures.tiny import fresh_weights
 
 
 def small_net() -> nn.Module:

@@ -16,7 +16,7 @@ from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.training.head_points import PointGatherer, PointSampler
 from amvnet.training.plan import Plan
 
-from fixtures.worlds import fresh_weights, make_streets, write_recipe
+from fixtures.tiny import fresh_weights, make_streets, write_recipe
 
 ONE_CLASS = np.ones(1000, dtype=np.uint8)
 

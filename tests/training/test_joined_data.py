@@ -28,13 +28,12 @@ from amvnet.training.plan import open_parts, sized_by_init, without_weight_avera
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import load, save
 
+from fixtures.commands import refusal, run_cli
 from fixtures.own_scans import make_own_scans
-from fixtures.worlds import (
+from fixtures.tiny import (
     GOLDEN,
     fresh_weights,
     make_streets,
-    refusal,
-    run_cli,
     write_recipe,
 )
 

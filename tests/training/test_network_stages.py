@@ -23,7 +23,7 @@ from amvnet.training.losses import Targets, dice, lovasz_softmax
 from amvnet.training.networks import PolarStage, make_stage
 from amvnet.training.plan import Plan
 
-from fixtures.worlds import MODEL, street
+from fixtures.tiny import MODEL, street
 
 CONFIG = NetworkTraining(epochs=1, batch=2, lr=1e-3)
 MODEL_CONFIG = from_dict(ModelConfig, MODEL)

@@ -14,7 +14,7 @@ from amvnet.training.run_folder import (
     describe_changes,
 )
 
-from fixtures.worlds import fails
+from fixtures.commands import fails
 
 EARLIER = {
     "model": {"range_net": {"widths": [8, 16], "gru": True}},

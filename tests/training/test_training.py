@@ -38,17 +38,16 @@ from amvnet.training.networks import NetworkStage
 from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights, load, save
 
-from fixtures.worlds import (
+from fixtures.commands import files, run_cli
+from fixtures.tiny import (
     BUILDING,
     CAR,
     GOLDEN,
     ROAD,
     SIDEWALK,
     fake_drive,
-    files,
     fresh_weights,
     make_streets,
-    run_cli,
     write_recipe,
 )
 

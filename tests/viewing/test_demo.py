@@ -13,7 +13,8 @@ from amvnet.data.taxonomy import NUSCENES
 from amvnet.weights.file import Weights, save
 
 from fixtures.browser_pages import Browser, browser, read_page
-from fixtures.worlds import fresh_weights, run_cli
+from fixtures.commands import run_cli
+from fixtures.tiny import fresh_weights
 
 __all__ = ["browser"]
 

@@ -28,14 +28,12 @@ from amvnet.viewing.shown_scans import RIGHT, ShownScan, shown_scan
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page, with_script
+from fixtures.commands import commands_of, files, run_cli
 from fixtures.scan_writers import write_bag1
-from fixtures.worlds import (
+from fixtures.tiny import (
     GOLDEN,
-    commands_of,
-    files,
     fresh_weights,
     make_streets,
-    run_cli,
     street,
     without,
 )

@@ -15,7 +15,7 @@ from amvnet.training.losses import class_weights
 from amvnet.weights.calibrate import calibrate, read_counts
 from amvnet.weights.file import load, save
 
-from fixtures.worlds import fresh_weights, without
+from fixtures.tiny import fresh_weights, without
 
 WEIGHTS = "sim-hdl64e"
 

@@ -11,7 +11,7 @@ import amvnet
 from amvnet.models.layers import ResidualBlock
 from amvnet.weights.growth import deepened
 
-from fixtures.worlds import fresh_weights, street
+from fixtures.tiny import fresh_weights, street
 
 
 def test_a_deeper_network_begins_as_the_shallower_one() -> None:

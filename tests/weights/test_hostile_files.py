@@ -27,7 +27,8 @@ from amvnet.sensors.lidars import make_sensor
 from amvnet.weights.card import model_card
 from amvnet.weights.file import FORMAT, Weights, load
 
-from fixtures.worlds import fails, fresh_weights
+from fixtures.commands import fails
+from fixtures.tiny import fresh_weights
 
 SECONDS = 2.0
 MEMORY = 1024**3  # bytes

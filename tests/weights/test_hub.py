@@ -16,7 +16,8 @@ import amvnet
 from amvnet.weights.card import model_card
 from amvnet.weights.file import load, save
 
-from fixtures.worlds import fails, fresh_weights, run_cli, street, without
+from fixtures.commands import fails, run_cli
+from fixtures.tiny import fresh_weights, street, without
 
 NAME = "hf-hub:somebody/streets"
 POINTS = street(3, 300)[0]

@@ -13,7 +13,13 @@ import amvnet
 from amvnet.inference.segmentation import Verdict, uncertain_share
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 
-from fixtures.worlds import fresh_weights, make_streets, run_cli, street, without
+from fixtures.commands import run_cli
+from fixtures.tiny import (
+    fresh_weights,
+    make_streets,
+    street,
+    without,
+)
 
 POINTS = street(5, 400)[0]
 

@@ -23,7 +23,8 @@ from amvnet.training.losses import class_weights
 from amvnet.training.networks import NetworkStage
 from amvnet.weights.file import save
 
-from fixtures.worlds import fresh_weights, make_streets, run_cli, write_recipe
+from fixtures.commands import run_cli
+from fixtures.tiny import fresh_weights, make_streets, write_recipe
 
 
 @pytest.fixture(scope="module")

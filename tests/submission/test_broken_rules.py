@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fixtures.commands import run_cli
 from fixtures.submissions import Case, Entries, write_files
-from fixtures.worlds import run_cli
 
 
 @dataclass
