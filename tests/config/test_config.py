@@ -257,30 +257,6 @@ def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(
         load_recipe(write_recipe(tmp_path, text))
 
 
-def test_what_earlier_versions_wrote_is_read_if_it_asks_for_nothing_else() -> None:
-    """The model and the training of weights and recipes of commit 0ab4d2a, but for the defaults."""
-    earlier = {
-        "model": {
-            "assertion": {
-                "name": "disagreement",
-                "threshold": None,
-                "others": [],
-                "other_thresholds": [],
-                "combine": "any",
-            },
-            "point_head": {"pooling": "max", "heads": 1},
-        },
-        "training": {
-            "head": {"folds": 1, "class_weights": False},
-            "joint": {"batch": 2, "ema": 0.99},
-            "adapt": {"rounds": 1},
-            "compile": False,
-            "augment": {"far_drop": 0.0, "intensity_noise": 0.0},
-        },
-    }
-    assert from_dict(Recipe, earlier) == Recipe()
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -337,7 +313,7 @@ def test_every_number_of_a_recipe_has_two_bounds() -> None:
         for name, kind in get_type_hints(cls, include_extras=True).items():
             if isinstance(kind, type) and is_dataclass(kind):
                 yield from numbers(kind)
-            elif name != "obsolete":
+            else:
                 item_kind = get_args(kind)[0] if get_origin(kind) is tuple else kind
                 yield f"{cls.__name__}.{name}", item_kind
 

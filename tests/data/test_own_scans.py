@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from amvnet.data.datasets.open import open_dataset, open_with_classes
+from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.select import split_records, training_records
 from amvnet.data.labels.readers import read_scan_labels
@@ -267,7 +267,8 @@ def test_the_classes_that_differ_are_named(tmp_path: Path) -> None:
         ids = tuple(range(len(names) + 1))
         colors = ((0, 0, 0),) * len(ids)
         weights = Taxonomy("own", names, colors, dict(enumerate(ids)), ids, {}, False)
-        fails(partial(open_with_classes, spec, weights), "own.yaml", *words)
+        own = open_dataset(spec, weights)
+        fails(partial(own.labelled, own.records(own.sequences("all"))), "own.yaml", *words)
 
 
 def test_label_files_that_match_the_pattern_of_scans_are_no_scans(tmp_path: Path) -> None:
@@ -396,4 +397,4 @@ def test_with_other_classes_the_scans_have_no_labels(site: Path) -> None:
     assert data.taxonomy == SEMANTICKITTI
     assert record.labels_path is None
     assert data.read(record).labels is None
-    fails(lambda: data.labelled([record]), "no labels")
+    fails(lambda: data.labelled([record]), "weights with the classes of the data")

@@ -15,7 +15,7 @@ import pytest
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.datasets.open import is_dataset, open_dataset, open_with_classes
+from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.datasets.select import split_records
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.laser_order import with_lasers
@@ -86,9 +86,7 @@ def test_streets_are_opened_by_the_name_of_their_sensor(sensor: str, tmp_path: P
 
 
 def test_other_classes_are_refused(tmp_path: Path) -> None:
-    fails(
-        lambda: open_with_classes(f"simulated-hdl64e:{tmp_path}", NUSCENES), "classes", "nuscenes"
-    )
+    fails(lambda: open_dataset(f"simulated-hdl64e:{tmp_path}", NUSCENES), "classes", "nuscenes")
 
 
 def test_the_splits_are_different_streets(sensor: str, tmp_path: Path) -> None:

@@ -16,12 +16,12 @@ import torch
 from rosbags.typesys import Stores, get_typestore
 
 import amvnet
-from amvnet.data.datasets.open import open_dataset, open_with_classes
+from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.evaluation.scoring import label_by_weights
 from amvnet.export.onnx import export
 from amvnet.inference.listing import list_inputs
-from amvnet.inference.reading import normalised_for, normaliser_for
+from amvnet.inference.reading import normalised, normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
@@ -181,8 +181,8 @@ def by_view(world: World, points: np.ndarray) -> np.ndarray:
 
 
 def by_evaluate(world: World, points: np.ndarray) -> np.ndarray:
-    data = world.write_own(points)
-    return _evaluated(world, normalised_for(world.segmenter.weights, open_dataset(str(data))))
+    dataset = open_dataset(str(world.write_own(points)))
+    return _evaluated(world, normalised(dataset, normaliser_for(world.segmenter.weights)))
 
 
 def by_node(world: World, points: np.ndarray) -> np.ndarray:
@@ -203,7 +203,7 @@ def by_predict_of_a_dataset(world: World, points: np.ndarray) -> np.ndarray:
 
 def by_evaluate_of_a_dataset(world: World, points: np.ndarray) -> np.ndarray:
     data = str(world.write_kitti(points))
-    return _evaluated(world, open_with_classes(data, SEMANTICKITTI))
+    return _evaluated(world, open_dataset(data, SEMANTICKITTI))
 
 
 def _evaluated(world: World, dataset: Any) -> np.ndarray:

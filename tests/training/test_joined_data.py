@@ -18,7 +18,7 @@ from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.reading import open_for_weights
+from amvnet.inference.reading import normalised, normaliser_for
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.record import AS_IS
@@ -132,7 +132,7 @@ def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_f
 def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) -> None:
     """Scans with rows and scans without are mixed point by point."""
     scans = joined(tmp_path, 0)
-    own = open_for_weights(str(own_file), fresh_weights())
+    own = normalised(open_dataset(str(own_file)), normaliser_for(fresh_weights()))
     mixed = join(scans, [TrainingScans(own, own.records(own.sequences("all")), [])])
     a, b = (mixed.dataset.read(record) for record in (mixed.train[0], mixed.train[-1]))
     assert a.row is None
@@ -152,7 +152,7 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
 ) -> None:
     paths = [make_own_scans(tmp_path / name) for name in "ab"]
     weights = fresh_weights(open_own(paths[0]).taxonomy)
-    own = [open_for_weights(str(path), weights) for path in paths]
+    own = [normalised(open_dataset(str(path)), normaliser_for(weights)) for path in paths]
     records = [dataset.records(dataset.sequences("train")) for dataset in own]
     scans = join(TrainingScans(own[0], records[0], ()), [TrainingScans(own[1], records[1], ())])
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 from amvnet.errors import InputError, shown
 
@@ -42,19 +41,9 @@ MOST_ITEMS = 12  # of a list of values, such as the channels of a network's laye
 Count = Annotated[int, Range(1, 1_000_000)]  # far above any use
 Share = Annotated[float, Range(0, 1)]
 
-# By field, the values that earlier versions wrote and that ask for what is done now anyway. None
-# stands for any value.
-Obsolete = Mapping[str, Sequence[Any] | None]
-
 
 class Checked:
-    """A base class of dataclasses whose numbers must be finite and in their `Range`.
-
-    Attributes:
-        obsolete: values that files of earlier versions may still name; they are skipped.
-    """
-
-    obsolete: ClassVar[Obsolete] = {}
+    """A base class of dataclasses whose numbers must be finite and in their `Range`."""
 
     def __post_init__(self) -> None:
         """Check every number.

@@ -78,19 +78,9 @@ def flat(tree: Any, name: str = "", depth: int = DEEPEST) -> Iterator[tuple[str,
 def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
     """Return a copy of a dataclass with the values of a tree; raise the errors of `from_dict`."""
     field_types = get_type_hints(type(default))
-    field_types.pop("obsolete", None)  # an attribute of the class, not a field
-    obsolete = getattr(default, "obsolete", {})
 
     changes = {}
     for key, value in tree.items():
-        accepted = obsolete.get(key, ())
-        if accepted is None or value in accepted:  # asks for what is done anyway
-            continue
-        if key not in field_types and accepted:
-            raise InputError(
-                f"{where}: {key}: expected {' or '.join(map(str, accepted))}, "
-                f"found {shown(value)}, which was removed; use the version that wrote it"
-            )
         if key not in field_types:
             raise InputError(
                 f"{where}: expected one of {', '.join(field_types)}, found {shown(key)}"

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-from amvnet.config.bounds import Checked, Obsolete, Range, Share
+from amvnet.config.bounds import Checked, Range, Share
 
 StageName = Literal["rv", "bev", "head"]
 
@@ -192,14 +192,6 @@ class AssertionConfig(Checked):
     threshold: Share = 0.85
     """tau: the largest cosine similarity of the two networks' scores of an uncertain point."""
 
-    obsolete: ClassVar[Obsolete] = {
-        "threshold": (None,),  # the default
-        "name": ("disagreement",),
-        "others": ([],),
-        "other_thresholds": ([],),
-        "combine": ("any", "all"),
-    }
-
 
 @dataclass(frozen=True)
 class PointHeadConfig(Checked):
@@ -220,8 +212,6 @@ class PointHeadConfig(Checked):
         super().__post_init__()
 
         self.check(len(self.hidden) > 0, "one or more hidden layers", "none")
-
-    obsolete: ClassVar[Obsolete] = {"pooling": ("max",), "heads": (1,)}
 
 
 @dataclass(frozen=True)
@@ -282,8 +272,6 @@ class AugmentConfig(Checked):
     """Probability of taking every second band of elevation from another scan (LaserMix; open)."""
     paste: Share = 0.0
     """Probability of adding the rare objects of another scan, also turned (PolarMix; open)."""
-
-    obsolete: ClassVar[Obsolete] = {"intensity_noise": (0.0,), "far_drop": (0.0,)}
 
 
 @dataclass(frozen=True)
@@ -362,8 +350,6 @@ class HeadTraining(Checked):
     balance: Share = 0.0
     """How far draws even out the classes: 0 draws points alike, 1 classes equally often (open)."""
 
-    obsolete: ClassVar[Obsolete] = {"folds": (1,), "class_weights": (False,)}
-
 
 @dataclass(frozen=True)
 class TrainingConfig(Checked):
@@ -390,8 +376,6 @@ class TrainingConfig(Checked):
     bfloat16 arithmetic, 32-true on others; 64 to compare trainings."""
     accelerator: str = "auto"
     """Lightning's accelerator: auto, cpu, gpu."""
-
-    obsolete: ClassVar[Obsolete] = {"joint": None, "adapt": None, "compile": (False,)}
 
 
 @dataclass(frozen=True)

@@ -190,6 +190,16 @@ class Taxonomy:
             )
 
 
+def check_classes(source: str, of_data: Taxonomy, of_weights: Taxonomy) -> None:
+    """Raise InputError, naming the source of the data, if weights have other classes."""
+    if of_data.classes != of_weights.classes:
+        raise InputError(
+            f"{source}: expected weights with the classes of the data, found "
+            f"{describe_difference(of_data.classes, of_weights.classes, of_weights.name)}; "
+            "use weights with these classes, or map both by --classes"
+        )
+
+
 def describe_difference(classes: Sequence[str], others: Sequence[str], of_others: str) -> str:
     """Return in words how some classes differ from others, by their names.
 

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.open import check_classes
 from amvnet.data.spacing import evenly_spaced
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import PICTURE, TopView, draw_scan
@@ -83,7 +82,7 @@ def evaluate(
     """
     taxonomy = dataset.taxonomy if labeller.classes is None else labeller.classes.target
     if labeller.classes is None:
-        check_classes(dataset, labeller.taxonomy)
+        check_classes(dataset.spec, dataset.taxonomy, labeller.taxonomy)
     true_table = labeller.table(dataset.taxonomy)
     table = labeller.table(labeller.taxonomy)
     evaluation = Evaluation(taxonomy)

@@ -11,8 +11,7 @@ from typing import overload
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
-from amvnet.data.datasets.open import open_if_dataset
-from amvnet.data.datasets.own import OwnScans
+from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
@@ -22,7 +21,7 @@ from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
-from amvnet.inference.reading import normalised_by
+from amvnet.inference.reading import normalised
 from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Normaliser
@@ -263,10 +262,10 @@ def list_inputs(
     scans: list[InputScan] = []
     taxonomies: list[Taxonomy] = []
     for spec in inputs:
-        dataset = open_if_dataset(spec, taxonomy)
-        if dataset is not None:
-            if isinstance(dataset, OwnScans) and normaliser is not None:
-                dataset = normalised_by(normaliser, dataset)
+        if is_dataset(spec):
+            dataset = open_dataset(spec, taxonomy)
+            if normaliser is not None:
+                dataset = normalised(dataset, normaliser)
             for record in choose_records(dataset, options.sequences, options.split):
                 scans.append(DatasetScan(dataset, record))
             taxonomies.append(dataset.taxonomy)

@@ -7,7 +7,6 @@ import warnings
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.datasets.open import open_with_classes
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.cloud import require_columns
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
@@ -122,39 +121,20 @@ def expectation_of(weights: Weights) -> Expectation:
     )
 
 
-def open_for_weights(spec: str, weights: Weights) -> Dataset:
-    """Open a dataset with the classes of some weights; normalise its scans to the weights.
+def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
+    """Return a dataset whose scans are normalised as scan files are.
+
+    Only a user's own scans are: the scans of the benchmarks are as weights expect them.
 
     Args:
-        spec: the dataset, as `open_dataset` takes it.
+        normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML
+            file says of it counts.
 
     Raises:
-        InputError: if there is no such dataset, or it has other classes.
+        InputError: if the YAML file describes an impossible sensor.
     """
-    return normalised_for(weights, open_with_classes(spec, weights.taxonomy))
-
-
-def normalised_for(weights: Weights, dataset: Dataset) -> Dataset:
-    """Return a dataset whose scans are read as some weights expect them.
-
-    Scans of the benchmarks stay unchanged. A user's own scans are normalised, as `predict`
-    normalises scan files.
-    """
-    if isinstance(dataset, OwnScans):
-        return normalised_by(normaliser_for(weights), dataset)
-    return dataset
-
-
-def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
-    """Return a user's own scans, normalised as scan files are.
-
-    Args:
-        normaliser: the normaliser of scan files. If it knows nothing of the sensor, the sensor in
-            the dataset's file counts.
-
-    Raises:
-        InputError: if the file describes an impossible sensor.
-    """
+    if not isinstance(dataset, OwnScans):
+        return dataset
     if dataset.description.sensor is not None and normaliser.sensor == Sensor():
         with errors_of(f"{dataset.spec}: sensor"):
             sensor = make_sensor(dataset.description.sensor)

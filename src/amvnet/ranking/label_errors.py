@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.open import check_classes
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.scan_stream import stream_scans
@@ -92,7 +91,7 @@ def rank(
         InputError: if the weights lack a network or do not have the dataset's classes, or a scan
             has no labels.
     """
-    check_classes(dataset, segmenter.taxonomy)
+    check_classes(dataset.spec, dataset.taxonomy, segmenter.taxonomy)
     if not {"range_net", "polar_net"} <= set(segmenter.weights.parts):
         raise InputError("expected weights with both networks, found only one; train the other")
 

@@ -18,6 +18,7 @@ from amvnet.training.plan import Plan
 from amvnet.training.run import train
 from amvnet.training.run_folder import is_run
 from amvnet.weights.file import Weights
+from amvnet.weights.parts import replace_part
 
 # Whether with the GRU, and whether with class weights.
 VARIANTS = ((False, False), (True, False), (False, True), (True, True))
@@ -68,7 +69,7 @@ def _networks(weights: Weights, model: ModelConfig) -> Weights:
     """Return the two networks of some weights, for a head of another configuration."""
     networks = Weights(model, weights.taxonomy, weights.sensor)
     for part in BOTH_NETWORKS:
-        networks = networks.replace_part(part, weights)
+        networks = replace_part(networks, part, weights)
     return networks
 
 

@@ -17,7 +17,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.reading import normalised_for
+from amvnet.inference.reading import normalised, normaliser_for
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Reporter, report_nothing
@@ -186,7 +186,7 @@ def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None
     earlier = init or _earlier_weights(out)
     if earlier is not None:
         weights = dataclasses.replace(weights, training=earlier.training)
-    return normalised_for(weights, dataset)
+    return normalised(dataset, normaliser_for(weights))
 
 
 def open_parts(

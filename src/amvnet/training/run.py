@@ -29,7 +29,7 @@ from amvnet.training.run_folder import (
     write_record,
 )
 from amvnet.weights.file import Weights, save
-from amvnet.weights.growth import deepened
+from amvnet.weights.parts import deepened, fits, for_classes, replace_part, resized
 
 
 def train(
@@ -96,7 +96,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
 
     # The recipe decides the sizes of the part, whatever the weights have.
     L.seed_everything(plan.recipe.training.seed, verbose=False)
-    weights = weights.resized(PART_OF[name], plan.recipe.model)
+    weights = resized(weights, PART_OF[name], plan.recipe.model)
     if name == "head":
         train_head(plan, weights)
     else:
@@ -121,21 +121,21 @@ def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> 
         if init is None or part not in init.parts:
             continue
         # A new kind of head can be trained on the networks of any weights.
-        if name == "head" and name in trained and not init.fits(part, plan.recipe.model):
+        if name == "head" and name in trained and not fits(init, part, plan.recipe.model):
             plan.report("head: new, as that of the initial weights has other sizes")
             continue
         begin = _deepened(plan, init, part) if name in trained else init
         if init.taxonomy.classes == weights.taxonomy.classes:
-            weights = weights.replace_part(part, begin)
+            weights = replace_part(weights, part, begin)
         elif name in trained:
-            weights = weights.replace_part(part, _for_classes(plan, begin, part))
+            weights = replace_part(weights, part, _for_classes(plan, begin, part))
 
     return _with_finished(plan, weights)
 
 
 def _deepened(plan: Plan, init: Weights, part: str) -> Weights:
     """Return initial weights with as many residual blocks in a part as the recipe says."""
-    if part == "point_head" or init.fits(part, plan.recipe.model):
+    if part == "point_head" or fits(init, part, plan.recipe.model):
         return init
     deeper = deepened(init, part, plan.recipe.model, plan.recipe.training.seed)
     if deeper is None:
@@ -164,7 +164,7 @@ def _stages_of_folder(plan: Plan) -> Sequence[str]:
 def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
     """Return initial weights whose last layers are new, for the classes of the dataset."""
     taxonomy = plan.scans.dataset.taxonomy
-    weights, new = init.for_classes(taxonomy, plan.recipe.training.seed)
+    weights, new = for_classes(init, taxonomy, plan.recipe.training.seed)
     of_part = [name for name in new if name.startswith(f"{part}.")]
     plan.report(
         f"{part}: for the classes of {taxonomy.name}, all layers of the initial weights "

@@ -20,7 +20,8 @@ from amvnet.files import atomic_write, parse_yaml
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.outputs import check_not_read
 from amvnet.training.plan import Plan
-from amvnet.weights.file import SIZES, Weights, load
+from amvnet.weights.file import Weights, load
+from amvnet.weights.parts import SIZES, replace_part
 
 # The stages in order, and the part of the weights that each trains.
 PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
@@ -75,7 +76,7 @@ def is_finished(plan: Plan, name: str) -> bool:
 def with_trained(plan: Plan, name: str, weights: Weights) -> Weights:
     """Return weights with the best or last part of a stage, as the recipe says."""
     path = plan.out / name / f"{plan.recipe.training.keep}.safetensors"
-    return weights.replace_part(PART_OF[name], load(path))
+    return replace_part(weights, PART_OF[name], load(path))
 
 
 def write_record(plan: Plan, stage: str, init: Weights | None) -> None:

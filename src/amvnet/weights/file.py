@@ -29,13 +29,7 @@ from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
 from amvnet.weights import hub
 
-# The parts of the method, each with the fields of `ModelConfig` that set its sizes.
-SIZES = {
-    "range_net": ("range_view", "range_net"),
-    "polar_net": ("polar_view", "polar_net"),
-    "point_head": ("assertion", "point_head"),
-}
-PARTS = tuple(SIZES)
+PARTS = ("range_net", "polar_net", "point_head")  # of the method, by their names in `AMVNet`
 UNCERTAIN = "val/uncertain"  # metric of the point head: the share of uncertain points
 # The share for weights without this metric: that of the paper on nuScenes, and of `sim-hdl64e` on
 # simulated streets.
@@ -117,88 +111,6 @@ class Weights:
     def digests(self) -> dict[str, str]:
         """Return the digest of each part."""
         return {part: self.digest(part) for part in self.parts}
-
-    def replace_part(self, name: str, other: Weights) -> Weights:
-        """Return these weights with one part taken from other weights.
-
-        Raises:
-            InputError: if the other weights lack the part or have other classes.
-        """
-        if name not in other.parts:
-            raise InputError(
-                f"expected weights with the part {name}, found {', '.join(other.parts) or 'none'}; "
-                "train it first"
-            )
-
-        if self.taxonomy.classes != other.taxonomy.classes:
-            raise InputError(
-                f"expected weights for the classes of {self.taxonomy.name}, "
-                f"found those of {other.taxonomy.name}; train that part on this benchmark"
-            )
-
-        tensors = {}
-        for key, tensor in self.tensors.items():
-            if not key.startswith(f"{name}."):
-                tensors[key] = tensor
-        for key, tensor in other.part(name).items():
-            tensors[f"{name}.{key}"] = tensor
-
-        training = dict(self.training)
-        if name in other.training:
-            training[name] = other.training[name]
-        metrics = dict(self.metrics)
-        if name in other.metrics:
-            metrics[name] = other.metrics[name]
-
-        return dataclasses.replace(
-            self.resized(name, other.model), tensors=tensors, training=training, metrics=metrics
-        )
-
-    def for_classes(self, taxonomy: Taxonomy, seed: int) -> tuple[Weights, list[str]]:
-        """Return weights to begin a training for other classes with.
-
-        Parameters whose size depends on the number of classes are new: the last layers, and those
-        of the head that see the scores. All others are taken.
-
-        Returns:
-            The weights, without records of a training, and the names of the new parameters.
-        """
-        with torch.device("meta"):  # without memory
-            few = build_amvnet(self.model, 1).state_dict()
-            more = build_amvnet(self.model, 2).state_dict()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            fresh = build_amvnet(self.model, taxonomy.size).state_dict()
-
-        tensors = {}
-        new = []
-        for key, tensor in self.tensors.items():
-            depends_on_classes = few[key].shape != more[key].shape
-            tensors[key] = fresh[key] if depends_on_classes else tensor
-            if depends_on_classes:
-                new.append(key)
-        weights = dataclasses.replace(
-            self, taxonomy=taxonomy, tensors=tensors, training={}, metrics={}
-        )
-        return weights, new
-
-    def fits(self, name: str, model: ModelConfig) -> bool:
-        """Return whether the parameters of one part have the sizes of another configuration."""
-        with torch.device("meta"):  # without memory
-            part = getattr(build_amvnet(model, self.taxonomy.size), name)
-        try:
-            part.load_state_dict(self.part(name), assign=True)
-        except RuntimeError:
-            return False
-        return True
-
-    def resized(self, name: str, model: ModelConfig) -> Weights:
-        """Return these weights with the sizes of one part taken from another configuration.
-
-        The parameters stay unchanged: replace them as well before building the model.
-        """
-        sizes = {key: getattr(model, key) for key in SIZES[name]}
-        return dataclasses.replace(self, model=dataclasses.replace(self.model, **sizes))
 
     def build(self, with_head: bool = False) -> AMVNet:
         """Return the model, in evaluation mode.

@@ -47,11 +47,12 @@ def analyze(
         overwrite: replace figures that exist.
     """
     from amvnet.config.recipes import load_recipe
+    from amvnet.data.datasets.open import open_dataset
     from amvnet.data.datasets.select import TrainingScans
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
-    from amvnet.inference.reading import open_for_weights
+    from amvnet.inference.reading import normalised, normaliser_for
     from amvnet.outputs import check_outputs
     from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
     from amvnet.training.plan import Plan
@@ -63,7 +64,7 @@ def analyze(
             "give both or neither"
         )
     loaded = load(weights)
-    dataset = open_for_weights(data, loaded)
+    dataset = normalised(open_dataset(data, loaded.taxonomy), normaliser_for(loaded))
     segmenter = load_segmenter(loaded, "amvnet", compute)
     records = choice.records(dataset)
 

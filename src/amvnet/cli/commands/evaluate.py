@@ -50,13 +50,13 @@ def evaluate(
         overwrite: replace figures and drawings that exist.
     """
     from amvnet.data.class_maps import class_map
-    from amvnet.data.datasets.open import open_dataset, open_with_classes
+    from amvnet.data.datasets.open import open_dataset
     from amvnet.engines.precision import choose_device
     from amvnet.evaluation.metrics import REPORT
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files, pictures_of
     from amvnet.files import make_folder
-    from amvnet.inference.reading import normalised_for
+    from amvnet.inference.reading import normalised, normaliser_for
     from amvnet.outputs import check_outputs
     from amvnet.weights.file import load
 
@@ -64,8 +64,8 @@ def evaluate(
     mapping = None if classes is None else class_map(classes)
     if weights is not None and predictions is None:
         loaded = load(weights)
-        opened = open_with_classes(data, loaded.taxonomy) if mapping is None else open_dataset(data)
-        dataset = normalised_for(loaded, opened)
+        opened = open_dataset(data, loaded.taxonomy if mapping is None else None)
+        dataset = normalised(opened, normaliser_for(loaded))
         records = choice.records(dataset)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]

@@ -29,8 +29,9 @@ def rank(
         compute: where and how the networks are computed.
         overwrite: replace the table if it exists.
     """
+    from amvnet.data.datasets.open import open_dataset
     from amvnet.files import make_folder
-    from amvnet.inference.reading import open_for_weights
+    from amvnet.inference.reading import normalised, normaliser_for
     from amvnet.outputs import check_outputs
     from amvnet.ranking.label_errors import TABLE, write_clusters
     from amvnet.ranking.label_errors import rank as rank_records
@@ -40,7 +41,7 @@ def rank(
     check_outputs({out: TABLE}, [data, weights], overwrite)
     make_folder(out.parent)
     loaded = load(weights)
-    dataset = open_for_weights(data, loaded)
+    dataset = normalised(open_dataset(data, loaded.taxonomy), normaliser_for(loaded))
     records = choice.records(dataset, "all")
     segmenter = load_segmenter(loaded, "ensemble", compute)
 

@@ -52,7 +52,7 @@ class Description:
         taxonomy: the classes.
         scans: pattern of the scan files.
         labels: where the labels are; None if there are none.
-        reads_labels: whether the labels are read; not if they have other classes than `taxonomy`.
+        unread: classes of the labels, if they differ from `taxonomy`: such labels are not read.
         split: names of folders and scans, and patterns, by split; empty if there is no split.
         sensor: name or attributes of the sensor; None if it is to be measured.
         layout: what rows of numbers without names hold.
@@ -63,7 +63,7 @@ class Description:
     taxonomy: Taxonomy
     scans: str
     labels: LabelPlace | None = None
-    reads_labels: bool = True
+    unread: Taxonomy | None = None
     split: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sensor: str | Mapping[str, Any] | None = None
     layout: RowLayout = UNKNOWN

@@ -11,7 +11,7 @@ from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR, SimulatedStreets
-from amvnet.data.taxonomy import Taxonomy, describe_difference
+from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError
 
 Reader = type[SemanticKitti] | type[NuScenes]
@@ -23,7 +23,7 @@ SIMULATED = {
 }  # names of sensors by prefix
 
 
-def open_dataset(spec: str) -> Dataset:
+def open_dataset(spec: str, classes: Taxonomy | None = None) -> Dataset:
     """Open a dataset.
 
     Args:
@@ -31,14 +31,37 @@ def open_dataset(spec: str) -> Dataset:
             the layout of one of them; or `simulated-hdl64e:PATH` or `simulated-hdl32e:PATH`, for
             streets that are simulated when they are read and cached in a folder; or `files:FILE`,
             or only FILE, the YAML file that describes a user's own scans and classes.
+        classes: the classes that the dataset must have, for example the classes of weights. A
+            user's own scans can be opened with any classes; labels of other classes are not read.
 
     Raises:
-        InputError: if the path does not exist or does not have the layout.
+        InputError: if the path does not exist or does not have the layout, or the dataset has other
+            classes.
     """
+    dataset = _open(spec)
+    if classes is None or dataset.taxonomy.classes == classes.classes:
+        return dataset
+    if isinstance(dataset, OwnScans):
+        return dataset.with_classes(classes)
+    check_classes(dataset.spec, dataset.taxonomy, classes)
+    return dataset
+
+
+def is_dataset(spec: str) -> bool:
+    """Return whether a text names a dataset, by its prefix or by the layout of its folder."""
+    path, version = _split_version(spec)
+    kind = spec.partition(":")[0]
+    if kind in READERS or kind in SIMULATED or _is_own(spec) or version is not None:
+        return True
+    return path.is_dir() and bool(_readers_of(path))
+
+
+def _open(spec: str) -> Dataset:
+    """Open a dataset with its own classes."""
     kind, _, rest = spec.partition(":")
     if kind in SIMULATED:
         return SimulatedStreets(Path(os.path.expanduser(rest)), SIMULATED[kind])
-    if is_own(spec):
+    if _is_own(spec):
         return open_own(spec.removeprefix(f"{OWN}:"))
 
     path, version = _split_version(rest if kind in READERS else spec)
@@ -57,50 +80,9 @@ def open_dataset(spec: str) -> Dataset:
     return reader(path)
 
 
-def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
-    """Open a dataset; raise InputError if it does not have these classes."""
-    dataset = open_dataset(spec)
-    check_classes(dataset, taxonomy)
-    return dataset
-
-
-def open_if_dataset(spec: str, taxonomy: Taxonomy | None) -> Dataset | None:
-    """Open a dataset, with these classes if given; return None for scan files."""
-    if not is_dataset(spec):
-        return None
-
-    dataset = open_dataset(spec)
-    if taxonomy is None:
-        return dataset
-    # If their own labels are left out, a user's scans can get labels of any classes.
-    if isinstance(dataset, OwnScans) and dataset.taxonomy.classes != taxonomy.classes:
-        return dataset.with_classes(taxonomy)
-    check_classes(dataset, taxonomy)
-    return dataset
-
-
-def is_own(spec: str) -> bool:
+def _is_own(spec: str) -> bool:
     """Return whether a text names the YAML file of a user's own scans."""
     return spec.partition(":")[0] == OWN or is_description(spec)
-
-
-def is_dataset(spec: str) -> bool:
-    """Return whether a text names a dataset, by its prefix or by the layout of its folder."""
-    path, version = _split_version(spec)
-    kind = spec.partition(":")[0]
-    if kind in READERS or kind in SIMULATED or is_own(spec) or version is not None:
-        return True
-    return path.is_dir() and bool(_readers_of(path))
-
-
-def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
-    """Raise InputError if a dataset has other classes than a taxonomy."""
-    if taxonomy.classes != dataset.taxonomy.classes:
-        raise InputError(
-            f"{dataset.spec}: expected weights with the classes of the data, found "
-            f"{describe_difference(dataset.taxonomy.classes, taxonomy.classes, taxonomy.name)}; "
-            "use weights with these classes, or map both by --classes"
-        )
 
 
 def _or_description(path: Path, advice: str = "check the path") -> str:

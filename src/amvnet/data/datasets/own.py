@@ -18,7 +18,7 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import ANY_FOLDERS, NamedScan, list_scans, matching, scan_stem
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_raw_labels
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError, did_you_mean, readable, reason_of, shown
 from amvnet.scan import Scan
 
@@ -96,9 +96,9 @@ class OwnScans(Dataset):
         if records and not labelled:
             place = self.description.labels
             found = "no labels in the description"
-            if not self.description.reads_labels:
-                found = f"no labels of the classes of {self.taxonomy.name}"
-            elif place is not None:
+            if self.description.unread is not None:
+                check_classes(self.spec, self.description.unread, self.taxonomy)
+            if place is not None:
                 scan = self._scans[records[0].name]
                 path = os.path.normpath(place.path_of(scan.path, scan.name))
                 found = f"no {path}"
@@ -159,7 +159,9 @@ class OwnScans(Dataset):
 
     def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
         """Return the scans for predictions of other classes; their labels are not read."""
-        description = dataclasses.replace(self.description, taxonomy=taxonomy, reads_labels=False)
+        description = dataclasses.replace(
+            self.description, taxonomy=taxonomy, unread=self.description.unread or self.taxonomy
+        )
         return OwnScans(description, self.normalise)
 
     def files_of(self, record: ScanRecord) -> list[Path]:
@@ -237,7 +239,7 @@ class OwnScans(Dataset):
                 name=name,
                 sequence=sequence,
                 points_path=scan.path,
-                labels_path=labels_path if has_labels and self.description.reads_labels else None,
+                labels_path=labels_path if has_labels and self.description.unread is None else None,
                 prediction=f"{name}.label",
             )
             listing.append((record, splits[name]))

@@ -1,0 +1,158 @@
+"""Weights put together from the parts of others: replaced, of other sizes, classes or depth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from amvnet.config.schema import ModelConfig
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import InputError
+from amvnet.models.amvnet import build_amvnet
+from amvnet.models.layers import ResidualBlock
+from amvnet.weights.file import Weights
+
+# Fields of `ModelConfig` that set the sizes of each part.
+SIZES = {
+    "range_net": ("range_view", "range_net"),
+    "polar_net": ("polar_view", "polar_net"),
+    "point_head": ("assertion", "point_head"),
+}
+
+
+def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
+    """Return weights with one part, its sizes and its records taken from other weights.
+
+    Raises:
+        InputError: if the other weights lack the part or have other classes.
+    """
+    if part not in other.parts:
+        raise InputError(
+            f"expected weights with the part {part}, found {', '.join(other.parts) or 'none'}; "
+            "train it first"
+        )
+    if weights.taxonomy.classes != other.taxonomy.classes:
+        raise InputError(
+            f"expected weights for the classes of {weights.taxonomy.name}, found weights for "
+            f"{other.taxonomy.name}; train that part on this benchmark"
+        )
+
+    tensors = {}
+    for key, tensor in weights.tensors.items():
+        if not key.startswith(f"{part}."):
+            tensors[key] = tensor
+    for key, tensor in other.part(part).items():
+        tensors[f"{part}.{key}"] = tensor
+
+    return dataclasses.replace(
+        resized(weights, part, other.model),
+        tensors=tensors,
+        training=_with_entry(weights.training, other.training, part),
+        metrics=_with_entry(weights.metrics, other.metrics, part),
+    )
+
+
+def resized(weights: Weights, part: str, model: ModelConfig) -> Weights:
+    """Return weights with the sizes of one part taken from another configuration.
+
+    The parameters stay unchanged: replace them as well before building the model.
+    """
+    sizes = {key: getattr(model, key) for key in SIZES[part]}
+    return dataclasses.replace(weights, model=dataclasses.replace(weights.model, **sizes))
+
+
+def fits(weights: Weights, part: str, model: ModelConfig) -> bool:
+    """Return whether the parameters of one part have the sizes of another configuration."""
+    with torch.device("meta"):  # without memory
+        module = getattr(build_amvnet(model, weights.taxonomy.size), part)
+    try:
+        module.load_state_dict(weights.part(part), assign=True)
+    except RuntimeError:
+        return False
+    return True
+
+
+def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weights, list[str]]:
+    """Return weights to begin a training for other classes with.
+
+    Parameters whose size depends on the number of classes are new: the last layers, and the layers
+    of the head that see the scores. All others are kept.
+
+    Args:
+        seed: seed of the new parameters.
+
+    Returns:
+        The weights, without records of a training, and the names of the new parameters.
+    """
+    with torch.device("meta"):  # without memory
+        few = build_amvnet(weights.model, 1).state_dict()
+        more = build_amvnet(weights.model, 2).state_dict()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        fresh = build_amvnet(weights.model, taxonomy.size).state_dict()
+
+    tensors = {}
+    new = []
+    for key, tensor in weights.tensors.items():
+        depends_on_classes = few[key].shape != more[key].shape
+        tensors[key] = fresh[key] if depends_on_classes else tensor
+        if depends_on_classes:
+            new.append(key)
+    begun = dataclasses.replace(weights, taxonomy=taxonomy, tensors=tensors)
+    return dataclasses.replace(begun, training={}, metrics={}), new
+
+
+def deepened(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights | None:
+    """Return weights in which one part has the residual blocks of a deeper configuration.
+
+    The part keeps its parameters. A new block begins as a skip connection: the scale of its last
+    batch norm is 0 (Goyal et al., 2017). The deeper network therefore computes the same as the
+    shallower one, except for the leak of one more activation.
+
+    Args:
+        weights: trained weights that hold the part.
+        part: "range_net" or "polar_net".
+        model: the configuration with the sizes of the deeper part.
+        seed: the seed of the other parameters of the new blocks.
+
+    Returns:
+        The weights, without a record of the part's training and metrics; None if the parts differ
+        in more than the number of residual blocks.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        module = getattr(build_amvnet(model, weights.taxonomy.size), part)
+
+    blocks = []
+    for name, layer in module.named_modules():
+        if isinstance(layer, ResidualBlock):
+            blocks.append(f"{name}.")
+            if not any(key.startswith(f"{part}.{name}.") for key in weights.tensors):
+                torch.nn.init.zeros_(cast(Tensor, layer.second[1].weight))
+
+    known = weights.part(part)
+    fresh = module.state_dict()
+    is_deeper = all(key in fresh and fresh[key].shape == known[key].shape for key in known)
+    is_new_block = all(key.startswith(tuple(blocks)) for key in fresh.keys() - known.keys())
+    if not is_deeper or not is_new_block:
+        return None
+
+    tensors = {key: value for key, value in weights.tensors.items() if not key.startswith(part)}
+    for key, value in (fresh | known).items():
+        tensors[f"{part}.{key}"] = value.contiguous()
+    return dataclasses.replace(
+        resized(weights, part, model),
+        tensors=tensors,
+        training=_with_entry(weights.training, {}, part),
+        metrics=_with_entry(weights.metrics, {}, part),
+    )
+
+
+def _with_entry(records: Mapping[str, Any], others: Mapping[str, Any], part: str) -> dict[str, Any]:
+    """Return records by part, with the record of one part from others, or without it."""
+    kept = {key: record for key, record in records.items() if key != part}
+    return kept | ({part: others[part]} if part in others else {})
