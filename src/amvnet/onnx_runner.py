@@ -80,8 +80,9 @@ class OnnxSegmenter:
         self.are_fractions = _takes_fractions(description)
         self.range_view = from_dict(RangeViewConfig, description.get("range_view", {}), source)
         self.polar_view = from_dict(PolarViewConfig, description.get("polar_view", {}), source)
-        assertion = dict(description.get("assertion", {}))
-        assertion.pop("name", None)  # for readers of the file; there is only one
+        assertion = description.get("assertion", {})
+        if isinstance(assertion, dict):  # its name is for readers of the file; there is only one
+            assertion = {key: value for key, value in assertion.items() if key != "name"}
         self.assertion = from_dict(AssertionConfig, assertion, source)
         self.head = from_dict(PointHeadConfig, description.get("point_head", {}), source)
 
