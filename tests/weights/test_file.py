@@ -25,7 +25,7 @@ from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmentation
 from amvnet.weights.file import PARTS, Weights, load, save
 
-from fixtures.worlds import fresh_weights, street
+from fixtures.tiny import fresh_weights, street
 
 POINTS = street(9)[0]
 
