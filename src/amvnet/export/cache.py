@@ -8,7 +8,7 @@ import uuid
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, TemporaryFile
 
 import torch
 
@@ -38,8 +38,9 @@ def cached_networks(
     """Return the graphs of some weights from the cache; export them if the cache lacks them.
 
     The files are compared with the digests in their description. If a file differs or is missing,
-    the networks are exported again. A cache that another user can write is not used: the networks
-    are exported for this process alone. Several processes may use the cache at the same time.
+    the networks are exported again. A cache that another user can write is not used, and a cache
+    that cannot be written is not filled: the networks are exported for this process alone. Several
+    processes may use the cache at the same time.
 
     Args:
         weights: trained weights.
@@ -54,18 +55,24 @@ def cached_networks(
     exported = "exported" if int8 is None else "exported and calibrated in int8"
     folder = user_cache() / "onnx" / _key(weights, int8)
     shared = shared_with_others(folder)
+    if shared is None:
+        with suppress(InputError):
+            return ExportedNetworks(_read(folder, weights), folder)
+
+    problem = None
     if shared is not None:
+        problem = f"{shared}: expected a cache that no other user can write, found that others can"
+    elif not _can_write(folder.parent):
+        problem = f"{folder.parent}: expected a cache to write to, found a place that is read-only"
+    if problem is not None:
         report(
-            f"{shared}: expected a cache that no other user can write, found one that others can; "
-            f"the networks are {exported} for this run alone; correct its owner and mode, or set "
-            f"{CACHE} to a folder of yours"
+            f"{problem}; the networks are {exported} for this run alone; correct its owner and "
+            f"mode, or set {CACHE} to a folder of yours"
         )
         with TemporaryDirectory() as temporary:
             export(weights, temporary, int8=int8)
             return ExportedNetworks(_read(Path(temporary), weights))
 
-    with suppress(InputError):
-        return ExportedNetworks(_read(folder, weights), folder)
     found = "" if not folder.exists() else ", because files in the cache were missing or changed"
     report(f"the networks are {exported}{found}, once for these weights, and kept in {folder}")
     return ExportedNetworks(_export(weights, int8, folder), folder)
@@ -90,9 +97,18 @@ def _read(folder: Path, weights: Weights) -> dict[str, bytes]:
     return {name: read_graph(folder, graphs[name]) for name in (RANGE_NET, UNET) if name in graphs}
 
 
+def _can_write(folder: Path) -> bool:
+    """Return whether files can be made in a folder, which is made if it does not exist."""
+    try:
+        make_private(folder)
+        with TemporaryFile(dir=folder):
+            return True
+    except (InputError, OSError):
+        return False
+
+
 def _export(weights: Weights, int8: str | None, folder: Path) -> dict[str, bytes]:
     """Export into a folder of the cache, which appears whole; return the contents of the graphs."""
-    make_private(folder.parent)
     part = folder.with_name(f".{uuid.uuid4().hex}.part")
     part.mkdir(PRIVATE_FOLDER)
     unfinished.add(part)
