@@ -22,7 +22,7 @@ from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from lidarstreets import simulate
-from lidarstreets.sensing.sensors import SENSORS, LidarModel
+from lidarstreets.sensing.sensors import LIDAR_MODELS, LidarModel
 
 SEED = 78
 VLP32C = (
@@ -35,7 +35,7 @@ VLP32C = (
 def sensor(elevations: tuple[float, ...], height: float, steps: int) -> LidarModel:
     """Return an HDL-64E with other lasers, at another height, on no car."""
     return replace(
-        SENSORS["hdl64e"], elevations=elevations, height=height, azimuth_steps=steps, shadow=()
+        LIDAR_MODELS["hdl64e"], elevations=elevations, height=height, azimuth_steps=steps, shadow=()
     )
 
 
@@ -45,8 +45,8 @@ def evenly(end: float, beams: int) -> tuple[float, ...]:
 
 
 OTHERS = {
-    "hdl64e-1.0m": sensor(SENSORS["hdl64e"].elevations, 1.0, 2180),
-    "hdl64e-2.5m": sensor(SENSORS["hdl64e"].elevations, 2.5, 2180),
+    "hdl64e-1.0m": sensor(LIDAR_MODELS["hdl64e"].elevations, 1.0, 2180),
+    "hdl64e-2.5m": sensor(LIDAR_MODELS["hdl64e"].elevations, 2.5, 2180),
     "vlp32c-1.07m": sensor(VLP32C, 1.07, 1800),
     "64-22.5-1.0m": sensor(evenly(22.5, 64), 1.0, 1024),
     "64-22.5-1.73m": sensor(evenly(22.5, 64), 1.73, 1024),
@@ -82,7 +82,7 @@ def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
 
 
 if __name__ == "__main__":
-    SENSORS.update(OTHERS)
+    LIDAR_MODELS.update(OTHERS)
     root = Path(sys.argv[1] if len(sys.argv) > 1 else "other_sensors")
     segmenter = amvnet.load(sys.argv[2] if len(sys.argv) > 2 else "sim-hdl64e")
     for name in OTHERS:

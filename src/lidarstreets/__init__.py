@@ -1,4 +1,4 @@
-"""Simulated LiDAR scans of procedural streets, labelled without a mistake.
+"""Simulate LiDAR scans of procedural streets. Every label is correct.
 
     lidarstreets.simulate("city", sequences=10, scans=4)
 
@@ -9,11 +9,11 @@ from lidarstreets.course import Drive
 from lidarstreets.drive import drive_street
 from lidarstreets.errors import SimulationError
 from lidarstreets.layouts import SimulatedScan
-from lidarstreets.sensing.sensors import SENSORS, LidarModel
+from lidarstreets.sensing.sensors import LIDAR_MODELS, LidarModel
 from lidarstreets.writing import simulate
 
 __all__ = [
-    "SENSORS",
+    "LIDAR_MODELS",
     "Drive",
     "LidarModel",
     "SimulatedScan",

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from lidarstreets import SENSORS, SimulationError, simulate
+from lidarstreets import LIDAR_MODELS, SimulationError, simulate
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,7 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("python -m lidarstreets", description=simulate.__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("out", type=Path)
-    parser.add_argument("--sensor", default="hdl64e", metavar="|".join(SENSORS))
+    parser.add_argument("--sensor", default="hdl64e", metavar="|".join(LIDAR_MODELS))
     parser.add_argument("--sequences", type=int, default=1)
     parser.add_argument("--scans", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)

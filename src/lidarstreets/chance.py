@@ -1,4 +1,4 @@
-"""Weighted random choice, and random numbers that are alike at neighbouring places."""
+"""Draw weighted choices, and random numbers that are alike at neighbouring places."""
 
 from collections.abc import Mapping
 from typing import TypeVar
@@ -7,13 +7,13 @@ import numpy as np
 
 Option = TypeVar("Option")
 
-# A hash of the indices of a cube: their product with large primes, up to the number of values.
-PRIMES = (73_856_093, 19_349_663, 83_492_791)
-HASHES = 2**16
+# The hash of a cube is the dot product of its indices and these primes, modulo `HASH_VALUES`.
+HASH_PRIMES = (73_856_093, 19_349_663, 83_492_791)
+HASH_VALUES = 2**16
 
 
 def weighted_choice(rng: np.random.Generator, shares: Mapping[Option, float]) -> Option:
-    """Draw one of the keys, each with a chance in proportion to its value."""
+    """Draw a key of `shares`; the chance of each key is proportional to its value."""
     weights = np.array(list(shares.values()))
     return list(shares)[rng.choice(len(weights), p=weights / weights.sum())]
 
@@ -21,11 +21,18 @@ def weighted_choice(rng: np.random.Generator, shares: Mapping[Option, float]) ->
 def patchy_normal(
     rng: np.random.Generator, places: np.ndarray, patch: float, correlation: float
 ) -> np.ndarray:
-    """Return (N,) standard normal numbers for the (N, 3) places, which are in metres.
+    """Draw one standard normal number for each place; the numbers are correlated within cubes.
 
-    The numbers of two places are correlated if they are in the same cube of `patch` metres.
+    Args:
+        rng: draws the numbers and the position of the cubes.
+        places: (N, 3) x, y, z in metres.
+        patch: edge of a cube in metres.
+        correlation: correlation in [0, 1] of the numbers of two places in one cube.
+
+    Returns:
+        (N,) float32 or float64.
     """
     cubes = np.floor(places / patch + rng.random(3)).astype(np.int64)
-    shared = rng.standard_normal(HASHES, np.float32)[cubes @ PRIMES % HASHES]
+    shared = rng.standard_normal(HASH_VALUES, np.float32)[cubes @ HASH_PRIMES % HASH_VALUES]
     own = rng.standard_normal(len(places), np.float32)
     return np.sqrt(correlation) * shared + np.sqrt(1 - correlation) * own

@@ -1,40 +1,43 @@
-"""Where the sensor drives in a street: in a lane, out of a side road or through a car park."""
+"""Draw where the sensor drives: in a lane, out of a side road or through a car park."""
 
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarstreets.sites.areas import AISLE, add_lot, has_room
+from lidarstreets.sites.areas import AISLE_DISTANCE, add_lot, has_room
 from lidarstreets.sites.site import Plot, Site
 from lidarstreets.streets.ground import Ground
 from lidarstreets.streets.plans import SideRoad
 
-# Shares of the streets in which the sensor comes out of a side road, drives through a car park,
-# turns in its lane, or drives at the edge of the road.
-FROM_SIDE_ROAD = 0.14
-IN_CAR_PARK = 0.04
-TURNING = 0.14
-AT_THE_EDGE = 0.12
-# Metres along the street: on longer courses, the sensor keeps to its lane.
-LONGEST_DETOUR = 50.0
-# Radians from scan to scan by which the phases of the sensor's sway and of its turn change.
+# Share of the short courses that come out of a side road, and share that cross a car park.
+SIDE_ROAD_SHARE = 0.14
+CAR_PARK_SHARE = 0.04
+# Share of the courses in a lane on which the sensor turns, and share at the edge of the road.
+TURNING_SHARE = 0.14
+ROAD_EDGE_SHARE = 0.12
+LONGEST_DETOUR = 50.0  # longest course that may leave the lane, metres along the street
+# Change of the phase of the sensor's sway, and of its turn, from scan to scan, radians.
 SWAY_STEP = 0.7
 TURN_STEP = 1.3
-HALF_CAR = 1.0  # metres: half the width of a car that drives at the edge of the road
+HALF_CAR_WIDTH = 1.0  # half the width of the car that carries the sensor, metres
 
 
 @dataclass(frozen=True)
 class Drive:
-    """How the sensor moves."""
+    """How the sensor moves.
 
-    # Metres between two scans.
+    Attributes:
+        spacing: distance between two scans, metres.
+        margin: length of the street before the first scan and after the last, metres.
+        scans_per_street: number of scans in one street. A longer sequence continues in another
+            street, so that memory stays bounded.
+        speed: smallest and largest speed, metres per second.
+    """
+
     spacing: float = 8.0
-    # Metres of street before the first scan and after the last.
     margin: float = 90.0
-    # Scans in one street. A longer sequence continues in another street: memory stays bounded.
     scans_per_street: int = 40
-    # Smallest and largest speed in metres per second.
     speed: tuple[float, float] = (5.0, 12.0)
 
 
@@ -43,13 +46,15 @@ class Course:
     """The course of the sensor through one street.
 
     Attributes:
-        ground: the street.
-        start: x along the street of the first scan; in a side road, distance from the street.
-        spacing: metres between two scans.
-        t: mean distance from the middle line of the street or of the side road, as in `Ground`.
-        sway: metres by which the sensor is farther left or right at times.
-        turn: largest angle in radians between the sensor and the street.
-        side_road: the side road that the sensor comes from; None on the street.
+        ground: the ground of the street.
+        start: place of the first scan, metres: x along the street, or on a side road the distance
+            from the street.
+        spacing: distance between two scans, metres.
+        t: mean signed distance from the middle line of the street or of the side road, metres; see
+            `MiddleLine`.
+        sway: amplitude with which the sensor sways to the left and right, metres.
+        turn: largest angle between the sensor and the street, radians.
+        side_road: the side road that the sensor comes out of, or None if it drives on the street.
     """
 
     ground: Ground
@@ -61,13 +66,13 @@ class Course:
     side_road: SideRoad | None = None
 
     def street_x(self, index: int) -> float:
-        """Return x along the street of a scan, or of the junction with the side road."""
+        """Return x of scan `index` along the street, or x of the junction with the side road."""
         if self.side_road is not None:
             return self.side_road.street_x
         return self.start + index * self.spacing
 
     def pose_at(self, index: int) -> tuple[float, float, float]:
-        """Return (x, y, yaw) of the sensor at a scan."""
+        """Return (x, y, yaw) of the sensor at scan `index`, in metres and radians."""
         sway = self.sway * math.sin(index * SWAY_STEP)
         if self.side_road is not None:
             along = self.start - index * self.spacing
@@ -78,12 +83,12 @@ class Course:
         return x, y, yaw + self.turn * math.cos(index * TURN_STEP)
 
     def places(self, scans: int) -> np.ndarray:
-        """Return the (P, 2) x and y of the sensor at the first `scans` scans."""
+        """Return x and y of the sensor at the first `scans` scans: (scans, 2), metres."""
         return np.array([self.pose_at(index)[:2] for index in range(scans)])
 
 
 def draw_course(site: Site, scans: int, rng: np.random.Generator, drive: Drive) -> Course:
-    """Draw the course of the sensor: mostly in a lane of the street."""
+    """Draw the course of the sensor; most courses follow a lane of the street."""
     ground = site.ground
     length = scans * drive.spacing
     sway = float(rng.uniform(-0.4, 0.4))
@@ -91,9 +96,9 @@ def draw_course(site: Site, scans: int, rng: np.random.Generator, drive: Drive) 
 
     choice = rng.random()
     course = None
-    if is_short and choice < FROM_SIDE_ROAD:
+    if is_short and choice < SIDE_ROAD_SHARE:
         course = _from_side_road(ground, length, rng, drive)
-    elif is_short and choice < FROM_SIDE_ROAD + IN_CAR_PARK:
+    elif is_short and choice < SIDE_ROAD_SHARE + CAR_PARK_SHARE:
         course = _through_car_park(site, scans, rng, drive)
     if course is None:
         course = _in_lane(ground, rng, drive)
@@ -103,7 +108,7 @@ def draw_course(site: Site, scans: int, rng: np.random.Generator, drive: Drive) 
 def _from_side_road(
     ground: Ground, length: float, rng: np.random.Generator, drive: Drive
 ) -> Course | None:
-    """Draw a course out of a side road, or return None if there is no suitable one."""
+    """Draw a course out of a side road, or return None if no side road is suitable."""
     side_road = _near_side_road(ground, length, drive)
     if side_road is None:
         return None
@@ -124,7 +129,7 @@ def _through_car_park(
     if not has_room(area, depth):
         return None
 
-    t = side * (ground.front(side) + AISLE)
+    t = side * (ground.front(side) + AISLE_DISTANCE)
     course = Course(ground, drive.margin, drive.spacing, t, sway=0.5)
     site.course = replace(course, sway=0.0).places(scans)
     add_lot(area, depth)
@@ -133,16 +138,16 @@ def _through_car_park(
 
 
 def _in_lane(ground: Ground, rng: np.random.Generator, drive: Drive) -> Course:
-    """Draw a course in a lane of the street, perhaps turning or at the edge of the road."""
+    """Draw a course in a lane; on some, the sensor turns or drives at the edge of the road."""
     ahead = [lane for lane, direction in ground.style.lanes if direction > 0]
     t = min(ahead) if rng.random() < 0.6 else float(rng.choice(ahead))
     turn = float(rng.normal(scale=0.01))
 
     choice = rng.random()
-    if choice < TURNING and ground.style.kind != "motorway":
+    if choice < TURNING_SHARE and ground.style.kind != "motorway":
         turn = float(rng.uniform(-0.7, 0.7))
-    elif choice < TURNING + AT_THE_EDGE:
-        edge = max(ground.style.road / 2 - HALF_CAR, 0.5)
+    elif choice < TURNING_SHARE + ROAD_EDGE_SHARE:
+        edge = max(ground.style.road / 2 - HALF_CAR_WIDTH, 0.5)
         t = float(np.clip(t + rng.uniform(-1.2, 1.2), -edge, edge))
     return Course(ground, drive.margin, drive.spacing, t, sway=1.0, turn=turn)
 

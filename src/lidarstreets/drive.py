@@ -1,4 +1,4 @@
-"""Drives the sensor along simulated streets."""
+"""Drive the sensor along simulated streets."""
 
 import math
 from collections.abc import Iterator
@@ -17,10 +17,10 @@ from lidarstreets.sites.site import MOVING_CLEARANCE, Site, covers
 from lidarstreets.streets.ground import Ground
 from lidarstreets.streets.styles import draw_style
 
-SIGHT = 90.0  # metres along the street within which the sensor can see moving bodies
-WHEELBASE = 2.8  # metres
-TRACK = 1.5  # metres between left and right wheels
-STEEPEST_CAR = 0.2  # radians
+SIGHT_DISTANCE = 90.0  # largest distance of a visible moving body, metres along the street
+WHEELBASE = 2.8  # distance between the axles of the car, metres
+TRACK_WIDTH = 1.5  # distance between the left and the right wheels, metres
+STEEPEST_TILT = 0.2  # largest pitch or roll that the ground gives the car, radians
 
 
 def drive_street(
@@ -32,10 +32,10 @@ def drive_street(
     """Yield the scans of one sequence, one after the other.
 
     Args:
-        sensor: the LiDAR, or its name in `SENSORS`.
+        sensor: the LiDAR, or its name in `LIDAR_MODELS`.
         scans: number of scans.
         seed: seed of all randomness.
-        drive: how the sensor moves; by default, as cars of both benchmarks do in towns.
+        drive: how the sensor moves; by default like the cars of both benchmarks in towns.
 
     Raises:
         SimulationError: if the sensor is unknown, or embreex is missing.
@@ -70,7 +70,7 @@ def drive_street(
 def _drive_one_street(
     sensor: LidarModel, lasers: Lasers, scans: int, rng: np.random.Generator, drive: Drive
 ) -> Iterator[SimulatedScan]:
-    """Yield the scans of one street, with poses relative to the first of them."""
+    """Yield the scans of one street; their poses are relative to the first scan."""
     style = draw_style(rng)
     end = drive.margin + scans * drive.spacing
     ground = Ground(style, end + drive.margin, rng, (drive.margin, end))
@@ -98,7 +98,7 @@ def _drive_one_street(
 def build_site(
     ground: Ground, scans: int, speed: float, rng: np.random.Generator, drive: Drive
 ) -> tuple[Site, Course]:
-    """Draw the course of the sensor, and fill the street around it."""
+    """Draw the course of the sensor, and fill the street around it with bodies."""
     site = Site(ground, rng)
     course = draw_course(site, scans, rng, drive)
     site.course = course.places(scans)
@@ -109,13 +109,13 @@ def build_site(
 
 
 def _moving_mesh(site: Site, course: Course, index: int, time: float) -> Mesh:
-    """Return the moving bodies that the sensor can see at a scan."""
+    """Return the moving bodies that the sensor can see at scan `index`, at a time in seconds."""
     ego_x = course.street_x(index)
     ego = np.array([course.pose_at(index)[:2]])
     bodies = []
     for mover in site.movers:
         x = mover.place(site.ground, time)
-        if abs(x - ego_x) < SIGHT and site.ground.is_street(x, 2.0):
+        if abs(x - ego_x) < SIGHT_DISTANCE and site.ground.is_street(x, 2.0):
             pose = mover.pose_at(site.ground, time)
             if not covers(mover.mesh, pose, ego, MOVING_CLEARANCE):
                 bodies.append(mover.at(site.ground, time))
@@ -125,15 +125,19 @@ def _moving_mesh(site: Site, course: Course, index: int, time: float) -> Mesh:
 def _tilted_pose(
     ground: Ground, sensor: LidarModel, place: tuple[float, float, float], rng: np.random.Generator
 ) -> np.ndarray:
-    """Return the (4, 4) pose of the sensor above (x, y, yaw), tilted by road and suspension."""
+    """Return the (4, 4) pose of the sensor above (x, y, yaw).
+
+    The road and the suspension tilt it.
+    """
     px, py, yaw = place
     yaw += rng.normal(scale=0.02)
     forward = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-forward[1], forward[0]])
 
-    # The slopes between the axles and the wheels, and the angles of car body and mounting.
+    # The slopes between the axles and between the wheels tilt the car; its body and the mounting of
+    # the sensor add their own angles.
     pitch = _slope(ground, place, forward * (WHEELBASE / 2)) + rng.normal(scale=0.004)
-    roll = _slope(ground, place, left * (TRACK / 2)) + rng.normal(scale=0.006)
+    roll = _slope(ground, place, left * (TRACK_WIDTH / 2)) + rng.normal(scale=0.006)
     pitch += np.radians(sensor.pitch)
     roll += np.radians(sensor.roll)
 
@@ -147,9 +151,12 @@ def _tilted_pose(
 
 
 def _slope(ground: Ground, place: tuple[float, float, float], step: np.ndarray) -> float:
-    """Return the angle in radians by which the ground rises between two sides of a place."""
+    """Return the slope of the ground from `place - step` to `place + step` as an angle in radians.
+
+    `step` is (x, y) in metres. The angle is positive if the ground rises.
+    """
     x = place[0] + step[0] * np.array([-1.0, 1.0])
     y = place[1] + step[1] * np.array([-1.0, 1.0])
     back, front = ground.height(x, y)
     angle = math.atan2(front - back, 2 * float(np.hypot(*step)))
-    return float(np.clip(angle, -STEEPEST_CAR, STEEPEST_CAR))
+    return float(np.clip(angle, -STEEPEST_TILT, STEEPEST_TILT))

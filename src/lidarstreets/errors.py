@@ -1,5 +1,5 @@
-"""The exception for input that cannot be used."""
+"""Define the exception for wrong input."""
 
 
 class SimulationError(ValueError):
-    """Streets that cannot be simulated: what was expected, what was found and what to do."""
+    """Wrong input to the simulator. One line says what was expected, what was found, what to do."""

@@ -1,4 +1,4 @@
-"""Writes simulated scans in the layouts of SemanticKITTI and nuScenes-lidarseg, and of a robot."""
+"""Write simulated scans in the layout of SemanticKITTI, nuScenes-lidarseg or a robot."""
 
 import errno
 import hashlib
@@ -21,21 +21,21 @@ from lidarstreets.materials import MOVING, Label
 
 Row = dict[str, Any]
 Tables = defaultdict[str, list[Row]]
-CLASS_MASK = np.uint32(0xFFFF)
+CLASS_MASK = np.uint32(0xFFFF)  # bits of a label that hold the class
 
-# From the LiDAR's axes (forward, left, up) to a camera's (right, down, forward), for calib.txt.
+# Transform for calib.txt from the LiDAR's axes (forward, left, up) to a camera's (right, down,
+# forward).
 _TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])
-# The matrix of a camera that does not exist; readers of calib.txt expect four.
+# Projection matrix of a camera that does not exist: readers of calib.txt expect four matrices.
 _CAMERA = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
-# The LiDAR of nuScenes looks to the right: x is right, y is forward.
+# Rotation from the LiDAR's axes to the axes of nuScenes' LiDAR: x is right, y is forward.
 _TO_NUSCENES = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-VERSION = "v1.0-trainval"
-# Microseconds: time of the first scan of scene 0, and between the first scans of two scenes.
-START = 1_600_000_000_000_000
-SCENE_STEP = 1_000_000_000
+NUSCENES_VERSION = "v1.0-trainval"
+FIRST_TIMESTAMP = 1_600_000_000_000_000  # time of the first scan of scene 0, microseconds
+SCENE_INTERVAL = 1_000_000_000  # time between the first scans of two scenes, microseconds
 
-# The ids of a robot's labels, by the class of a street; all other points have no class.
+# Ids of the robot's labels by class of a street; all other points get `_NO_CLASS`.
 _NO_CLASS = -1
 _ROBOT_IDS: dict[Label, int] = {
     **dict.fromkeys(
@@ -57,7 +57,7 @@ _ROBOT_IDS: dict[Label, int] = {
     ),
     **dict.fromkeys([Label.PERSON, Label.BICYCLIST, Label.MOTORCYCLIST], 9),
 }
-ROBOT = "robot.yaml"
+ROBOT_FILE = "robot.yaml"  # describes the scans and the labels of the robot
 _ROBOT_YAML = """\
 classes:
   ground: 3
@@ -70,12 +70,12 @@ scans: "*/clouds/*.pcd"
 labels: "../truth/{name}.npy"
 """
 
-# Errors of the system that another folder avoids.
-REFUSALS = (
+# Error numbers of the system that another output folder avoids.
+FOLDER_ERRNOS = (
     *(errno.EACCES, errno.EPERM, errno.EROFS),
     *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR),
 )
-WRITING = threading.Lock()  # held while a file is written
+WRITE_LOCK = threading.Lock()  # held while a file is written
 
 _CATEGORIES = ("noise", *sorted({label.category for label in Label} - {"noise"}))
 
@@ -85,12 +85,12 @@ class SimulatedScan:
     """One scan in memory.
 
     Attributes:
-        points: (N, 4) float32 x, y, z in metres and intensity in [0, 1], in the sensor's frame,
-            whose x is forward.
+        points: (N, 4) float32 x, y, z in metres and intensity in [0, 1]. The sensor is the origin;
+            x is forward, y left, z up.
         labels: (N,) uint32 ids of `Label` or `MOVING`, with the instance id in the upper 16 bits;
             0 for a lost return.
-        ring: (N,) uint8 index of the laser, 0 = lowest.
-        pose: (4, 4) from the sensor's frame to the sequence's.
+        ring: (N,) uint8 indices of the lasers; 0 is the lowest laser.
+        pose: (4, 4) transform from the sensor's frame to the frame of the sequence.
         time: seconds since the beginning of the sequence.
     """
 
@@ -110,7 +110,7 @@ class SimulatedScan:
     def nuscenes_categories(self) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the (N,) uint8 index of each point's category, and the names of all categories.
 
-        Lost returns are noise.
+        The categories are the categories of nuScenes-lidarseg. Lost returns are noise.
         """
         table = np.zeros(2**16, dtype=np.uint8)
         for label in Label:
@@ -120,7 +120,7 @@ class SimulatedScan:
 
 @dataclass
 class SemanticKittiLayout:
-    """OUT/sequences/XX with velodyne, labels, poses.txt, calib.txt and times.txt."""
+    """One sequence in OUT/sequences/XX: velodyne, labels, poses.txt, calib.txt and times.txt."""
 
     out: Path
     number: int
@@ -129,7 +129,7 @@ class SemanticKittiLayout:
 
     @staticmethod
     def place(out: Path, number: int) -> tuple[Path, bool]:
-        """Return the folder of a sequence, and whether it belongs to all sequences."""
+        """Return the folder of a sequence, and False: other sequences have other folders."""
         return out / "sequences" / f"{number:02d}", False
 
     @property
@@ -147,7 +147,7 @@ class SemanticKittiLayout:
         self.times.append(scan.time)
 
     def finish(self) -> Row:
-        """Write poses.txt (in the camera's frame), calib.txt and times.txt, as KITTI's odometry."""
+        """Write poses.txt (in the camera's frame), calib.txt and times.txt, like KITTI odometry."""
         from_camera = np.linalg.inv(_TO_CAMERA)
         poses = [_matrix_text(_TO_CAMERA @ pose @ from_camera) for pose in self.poses]
         cameras = [f"P{i}: {_matrix_text(_CAMERA)}" for i in range(4)]
@@ -160,12 +160,12 @@ class SemanticKittiLayout:
 
     @staticmethod
     def complete(out: Path, sequences: list[Row]) -> None:
-        """Do nothing: no file is about all sequences."""
+        """Do nothing: no file describes all sequences."""
 
 
 @dataclass
 class NuScenesLayout:
-    """OUT/samples and OUT/lidarseg, and one scene in the tables of OUT/v1.0-trainval."""
+    """One scene: files in OUT/samples and OUT/lidarseg, and rows of OUT/v1.0-trainval."""
 
     out: Path
     number: int
@@ -173,19 +173,19 @@ class NuScenesLayout:
 
     @staticmethod
     def place(out: Path, number: int) -> tuple[Path, bool]:
-        """Return the folder of the tables, and that it belongs to all sequences."""
-        return out / VERSION, True
+        """Return the folder of the tables, and True: all sequences share it."""
+        return out / NUSCENES_VERSION, True
 
     @property
     def name(self) -> str:
         return f"simulated-{self.number:04d}"
 
     def write_scan(self, index: int, scan: SimulatedScan) -> None:
-        """Write one scan and its labels, and keep what the tables need of it."""
+        """Write one scan and its labels, and keep what goes into the tables."""
         token = _token(self.name, "sample_data", index)
-        time = START + self.number * SCENE_STEP + round(scan.time * 1e6)
+        time = FIRST_TIMESTAMP + self.number * SCENE_INTERVAL + round(scan.time * 1e6)
         points_path = f"samples/LIDAR_TOP/{self.name}__LIDAR_TOP__{time}.pcd.bin"
-        labels_path = f"lidarseg/{VERSION}/{token}_lidarseg.bin"
+        labels_path = f"lidarseg/{NUSCENES_VERSION}/{token}_lidarseg.bin"
 
         xyz = scan.points[:, :3] @ _TO_NUSCENES.T
         columns = np.column_stack([xyz, np.round(scan.points[:, 3] * 255), scan.ring])
@@ -208,7 +208,7 @@ class NuScenesLayout:
 
     @staticmethod
     def complete(out: Path, sequences: list[Row]) -> None:
-        """Write the tables of all scenes, and an empty map."""
+        """Write the tables of all scenes in the folder, and an empty map."""
         tables: Tables = defaultdict(
             list, attribute=[], instance=[], sample_annotation=[], visibility=[]
         )
@@ -218,14 +218,16 @@ class NuScenesLayout:
 
         _write_empty_map(out / "maps" / "simulated.png")
         for name, rows in tables.items():
-            write_whole(out / VERSION / f"{name}.json", json.dumps(rows, indent=0).encode())
+            write_whole(
+                out / NUSCENES_VERSION / f"{name}.json", json.dumps(rows, indent=0).encode()
+            )
 
 
 @dataclass
 class RobotLayout:
-    """OUT/site_a/clouds/0000.pcd and OUT/site_a/truth/0000.npy, in a layout of no benchmark.
+    """One site of a robot: OUT/site_a/clouds/0000.pcd and OUT/site_a/truth/0000.npy.
 
-    OUT/robot.yaml describes them: five classes with ids of their own.
+    No benchmark has this layout. OUT/robot.yaml describes it: five classes with ids of their own.
     """
 
     out: Path
@@ -233,9 +235,12 @@ class RobotLayout:
 
     @staticmethod
     def place(out: Path, number: int) -> tuple[Path, bool]:
-        """Return the folder of a site, or if there is none the file that describes all sites."""
+        """Return the folder of a site and False, or the file about all sites and True.
+
+        The file is returned if the folder does not exist yet.
+        """
         folder = out / _site(number)
-        return (folder, False) if os.path.lexists(folder) else (out / ROBOT, True)
+        return (folder, False) if os.path.lexists(folder) else (out / ROBOT_FILE, True)
 
     @property
     def folder(self) -> Path:
@@ -264,10 +269,10 @@ class RobotLayout:
 
     @staticmethod
     def complete(out: Path, sequences: list[Row]) -> None:
-        """Write robot.yaml; the last of several sites validates."""
+        """Write robot.yaml; the last of several sites is the validation split."""
         *train, val = [sequence["site"] for sequence in sequences]
         split = f"split:\n  train: [{', '.join(train)}]\n  val: {val}\n" if train else ""
-        write_whole(out / ROBOT, (_ROBOT_YAML + split).encode())
+        write_whole(out / ROBOT_FILE, (_ROBOT_YAML + split).encode())
 
 
 LAYOUTS: Mapping[str, type[SemanticKittiLayout] | type[NuScenesLayout] | type[RobotLayout]] = {
@@ -278,7 +283,7 @@ LAYOUTS: Mapping[str, type[SemanticKittiLayout] | type[NuScenesLayout] | type[Ro
 
 
 def _site(number: int) -> str:
-    """Return "site_a" for 0, "site_z" for 25, "site_26" for 26."""
+    """Return the name of a site: "site_a" for 0, "site_z" for 25, "site_26" for 26."""
     return f"site_{chr(ord('a') + number) if number < 26 else number}"
 
 
@@ -314,7 +319,7 @@ def _add_scene(tables: Tables, sequence: Row) -> None:
     name = sequence["scene"]
     scene = _token(name)
 
-    # Tokens of the samples and of their scans; an empty one before the first and after the last.
+    # The tokens of the samples and of their scans stand between two empty tokens.
     samples = [""]
     for index in range(len(sequence["scans"])):
         samples.append(_token(name, "sample", index))
@@ -363,7 +368,7 @@ def _add_scene(tables: Tables, sequence: Row) -> None:
 
 
 def _quaternion(rotation: np.ndarray) -> list[float]:
-    """Return w, x, y, z of a rotation matrix."""
+    """Return the unit quaternion (w, x, y, z) of a (3, 3) rotation."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
@@ -371,17 +376,18 @@ def _quaternion(rotation: np.ndarray) -> list[float]:
 
 
 def _token(*parts: object) -> str:
+    """Return the unique token that nuScenes' tables use for the row that `parts` name."""
     text = "/".join(map(str, parts))
     return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
 
 
 def _matrix_text(matrix: np.ndarray) -> str:
-    """Return the first three rows of a matrix as KITTI writes them."""
+    """Return the first three rows of a (4, 4) matrix as one line of 12 numbers, like KITTI."""
     return " ".join(f"{value:e}" for value in matrix[:3].ravel())
 
 
 def _write_empty_map(path: Path) -> None:
-    """Write the picture of a map that nuScenes' tools require."""
+    """Write a black picture of a map: nuScenes' tools require one."""
     from matplotlib.image import imsave
 
     picture = BytesIO()
@@ -394,23 +400,23 @@ def _write_lines(path: Path, lines: list[str]) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that appears whole or not at all, and its folder if there is none.
+    """Write a file, and its folder if there is none. The file appears whole or not at all.
 
     Raises:
-        SimulationError: if there may be no such file.
+        SimulationError: if the system refuses the file, as in a read-only folder.
     """
     part = path.with_name(f".{uuid.uuid4().hex}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with WRITING:
+        with WRITE_LOCK:
             try:
                 part.write_bytes(content)
                 os.replace(part, path)
             finally:
-                with suppress(OSError):  # of a read-only file system
+                with suppress(OSError):  # a read-only file system refuses this as well
                     part.unlink(missing_ok=True)
     except OSError as error:
-        if error.errno not in REFUSALS:
+        if error.errno not in FOLDER_ERRNOS:
             raise
         raise SimulationError(
             f"{path}: expected a file that can be written, found {error.strerror}; "

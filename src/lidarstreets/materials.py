@@ -1,4 +1,4 @@
-"""The classes of a simulated street, and how each kind of surface reflects a laser pulse."""
+"""Define the classes of a simulated street, and how each kind of surface reflects a pulse."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy as np
 class Label(IntEnum):
     """A class of a simulated street.
 
-    The values are raw SemanticKITTI ids; those from 300 are classes that only nuScenes has. The
-    category of nuScenes-lidarseg follows, then the raw SemanticKITTI id if it is another one.
+    Each value is a raw SemanticKITTI id. Values from 300 are classes that only nuScenes has. In the
+    table below, the category of nuScenes-lidarseg follows the value. The raw SemanticKITTI id comes
+    last, unless it is the value.
 
     Attributes:
-        category: of nuScenes-lidarseg; it counts riders as part of their vehicle.
-        raw: SemanticKITTI id.
+        category: category of nuScenes-lidarseg, which counts riders as part of their vehicle.
+        raw: raw SemanticKITTI id.
     """
 
     OUTLIER = 1, "noise"
@@ -60,7 +61,7 @@ class Label(IntEnum):
         return label
 
 
-# The raw SemanticKITTI id of moving bodies, by class. Other classes have no such id.
+# Raw SemanticKITTI ids of moving bodies by class. Other classes have no such id.
 MOVING = {
     Label.CAR: 252,
     Label.BICYCLIST: 253,
@@ -78,15 +79,16 @@ class Reflection:
 
     Attributes:
         reflectivity: intensity in [0, 1] that an HDL-64E reports for a near surface hit head-on.
-        spread: of the intensity between returns of one body, relative to its mean: scale of a
+        spread: how much the intensities of one body differ, relative to their mean: the scale of a
             Student's t distribution with three degrees of freedom.
         shade: standard deviation of the logarithm of the reflectivity between bodies.
-        dark: share of dark returns, which come in patches: glossy surfaces reflect most light
-            elsewhere.
-        drop: share of the pulses that never return, whatever the range.
+        dark: share of dark returns in [0, 1]. They come in patches: glossy surfaces reflect most
+            light elsewhere.
+        drop: share of the pulses in [0, 1] that never return, whatever the range.
         rough: standard deviation in metres of the height of relief, such as grass, that is too
-            fine for triangles; the median over places, which differ.
-        ghost: share of returns from a mirrored body and so from farther along the ray.
+            fine for triangles. It differs from place to place; this is the median.
+        ghost: share of the returns in [0, 1] that come from a mirrored body, and so seem to lie
+            farther along the ray.
     """
 
     reflectivity: float
@@ -99,7 +101,7 @@ class Reflection:
 
 
 class Surface(IntEnum):
-    """A kind of surface; the value is its row in `REFLECTIONS`."""
+    """A kind of surface. Its value is its row in `REFLECTIONS`."""
 
     ASPHALT = Reflection(0.28, spread=0.09, shade=0.14, dark=0.04, rough=0.0004)
     PAVING = Reflection(0.32, spread=0.08, shade=0.12, dark=0.02, rough=0.0006)
@@ -116,22 +118,22 @@ class Surface(IntEnum):
     SIGN_FACE = Reflection(0.50, spread=0.13, shade=0.40)
     CLOTH = Reflection(0.46, spread=0.20, shade=0.25, rough=0.005)
     SKIN = Reflection(0.45, spread=0.20, shade=0.10, dark=0.03)
-    # Cars: most of a pulse is reflected elsewhere, whatever the colour.
+    # The paint of cars, which reflects most of a pulse elsewhere, whatever its colour.
     DARK_PAINT = Reflection(0.13, spread=0.25, shade=0.50, dark=0.75, drop=0.08, rough=0.003)
     LIGHT_PAINT = Reflection(0.34, spread=0.15, shade=0.40, dark=0.50, drop=0.05, rough=0.003)
-    # Load boxes, caravans and machines.
+    # The coating of load boxes, caravans and machines.
     COATING = Reflection(0.42, spread=0.15, shade=0.25, dark=0.05, drop=0.006, rough=0.003)
-    # Tubes, rims and spokes of a bicycle.
+    # The tubes, rims and spokes of a bicycle.
     CYCLE = Reflection(0.42, spread=0.6, shade=0.4, dark=0.08, drop=0.05)
     RUBBER = Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.05)
     PLATE = Reflection(0.95, spread=0.10, shade=0.10, dark=0.0)
     PLASTIC = Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.006)
     ROOF_TILE = Reflection(0.33, spread=0.13, shade=0.20, drop=0.001, rough=0.003)
-    # The window of a house. Unlike a car's, it has curtains and frames that reflect.
+    # The windows of houses: unlike the windows of cars, they have curtains and frames that reflect.
     WINDOW = Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.03, rough=0.01, ghost=0.02)
     STONE = Reflection(0.36, spread=0.16, shade=0.25, rough=0.013)
     TWIG = Reflection(0.30, spread=0.26, shade=0.20, dark=0.03, drop=0.008)
-    # Poles, which are painted or galvanised.
+    # The painted or galvanised steel of poles.
     MAST = Reflection(0.30, spread=0.45, shade=0.40, dark=0.15, drop=0.006, rough=0.004)
 
     reflection: Reflection
@@ -144,10 +146,10 @@ class Surface(IntEnum):
         return surface
 
 
-# (S, 7): rows are the surfaces by value, columns the fields of `Reflection` in order.
+# Reflections as one (S, 7) table: a row for each surface, a column for each field of `Reflection`.
 REFLECTIONS = np.array([astuple(surface.reflection) for surface in Surface], dtype=np.float32)
 
-# The surface of each class of ground.
+# Kind of surface of each class of ground.
 GROUND_SURFACES = {
     Label.ROAD: Surface.ASPHALT,
     Label.PARKING: Surface.PAVING,

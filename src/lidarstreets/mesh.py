@@ -1,4 +1,4 @@
-"""Labelled triangle meshes."""
+"""Build, join and move labelled triangle meshes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -11,18 +11,19 @@ from lidarstreets.solids import moved
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with a surface, a class and an instance each.
+    """T triangles. Each has a surface, a class and an instance.
 
     Attributes:
         triangles: (T, 3, 3) float32 corners in metres; a body stands on z = 0.
-        surface: (T,) uint8 rows of the reflection table.
+        surface: (T,) uint8 values of `Surface`.
         label: (T,) uint16 class ids; 0 is ground, whose class depends on the place.
-        instance: (T,) uint16 instance ids; 0 is none.
-        depth: (T,) float32 mean distance in metres that a pulse travels inside the triangles
-            before it is reflected, if there were no gaps between the leaves; 0 is solid. A mesh
-            that is not solid must be closed, with its corners counter-clockwise seen from outside.
-        tint: (T,) float32 brightness of the surface, in standard deviations from the mean of its
-            kind.
+        instance: (T,) uint16 instance ids; 0 is no instance.
+        depth: (T,) float32 mean distance in metres that a pulse travels behind the triangle before
+            a leaf reflects it, without the gaps between clumps of leaves; 0 is a solid surface. A
+            mesh that is not solid must be closed, with its corners counter-clockwise seen from
+            outside.
+        tint: (T,) float32 brightness of the surface, in standard deviations (`Reflection.shade`)
+            from the mean of its kind.
     """
 
     triangles: np.ndarray
@@ -36,7 +37,7 @@ class Mesh:
         return len(self.triangles)
 
 
-# Draws one body.
+# Function that draws one body.
 Maker = Callable[[np.random.Generator], Mesh]
 
 
@@ -48,9 +49,14 @@ def part(
     *,
     tint: float = 0,
 ) -> Mesh:
-    """Return solids, (T, 3, 3) each, as one mesh of one surface and one class.
+    """Return several solids as one mesh of one surface and one class.
 
-    See `Mesh` for the depth and the tint.
+    Args:
+        solids: (T, 3, 3) triangles of each solid, metres.
+        surface: surface of all triangles.
+        label: class id of all triangles.
+        depth: depth in metres, as in `Mesh`; 0 is solid.
+        tint: brightness, as in `Mesh`.
     """
     triangles = np.concatenate([np.zeros((0, 3, 3)), *solids])
     count = len(triangles)
@@ -66,7 +72,7 @@ def part(
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """Return several meshes as one; the result is empty if there are none."""
+    """Return several meshes as one mesh, or an empty mesh if there are none."""
     if not meshes:
         return part([], Surface.ASPHALT, 0)
 
@@ -78,13 +84,13 @@ def join(*meshes: Mesh) -> Mesh:
 
 
 def place(mesh: Mesh, x: float = 0, y: float = 0, z: float = 0, yaw: float = 0) -> Mesh:
-    """Return the mesh turned by `yaw` radians about the z axis, then moved by metres."""
+    """Return the mesh turned by `yaw` radians about the z axis, then moved by x, y, z metres."""
     corners = moved(mesh.triangles, (x, y, z), yaw)
     return replace(mesh, triangles=corners.astype(np.float32))
 
 
 def scaled(mesh: Mesh, factor: float) -> Mesh:
-    """Return the mesh, its size multiplied by a factor."""
+    """Return the mesh `factor` times as large, seen from the origin."""
     return replace(mesh, triangles=mesh.triangles * np.float32(factor))
 
 
@@ -103,7 +109,7 @@ def with_random_tint(mesh: Mesh, rng: np.random.Generator) -> Mesh:
 
 
 def with_labels(mesh: Mesh, labels: dict[Label, int]) -> Mesh:
-    """Return the mesh with the class ids that are keys of `labels` replaced by their values."""
+    """Return the mesh with other class ids: `labels` gives the new id for each old one."""
     label = mesh.label.copy()
     for old, new in labels.items():
         label[mesh.label == old] = new

@@ -1,4 +1,7 @@
-"""Solids that all bodies are built from, as (T, 3, 3) corners of triangles in metres."""
+"""Make the solids that all bodies are built from.
+
+Each solid is an array of (T, 3, 3) corners of T triangles, in metres.
+"""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -11,7 +14,7 @@ Vector = tuple[float, float, float]
 
 # Corners of the unit box, whose lower face is centred on the origin; x changes fastest.
 _BOX_CORNERS = np.array(list(product((0.0, 1.0), (-0.5, 0.5), (-0.5, 0.5))))[:, ::-1]
-# Two triangles for each face, counter-clockwise seen from outside.
+# Corners of the two triangles of each face, counter-clockwise seen from outside.
 _BOX_FACES = np.array([
     (0, 3, 1), (0, 2, 3),  # bottom
     (4, 5, 7), (4, 7, 6),  # top
@@ -25,9 +28,13 @@ _BOX_FACES = np.array([
 def box(
     size: Vector, at: Vector = (0, 0, 0), top: tuple[float, float] = (1, 1), shift: float = 0
 ) -> np.ndarray:
-    """Return the (12, 3, 3) triangles of a box whose lower face is centred `at` a place.
+    """Return the (12, 3, 3) triangles of a box.
 
-    The upper face is narrower by the factors `top` in x and y, and moved by `shift` along x.
+    Args:
+        size: length along x, width along y and height along z, metres.
+        at: centre of the lower face, metres.
+        top: size of the upper face in x and y as factors on the size of the lower face.
+        shift: distance by which the upper face is moved along x, metres.
     """
     corners = _BOX_CORNERS * np.array(size)
     corners[4:, :2] *= np.array(top)
@@ -38,9 +45,9 @@ def box(
 def copies(
     triangles: np.ndarray, x: ArrayLike = 0.0, y: ArrayLike = 0.0, z: ArrayLike = 0.0
 ) -> np.ndarray:
-    """Return copies of (T, 3, 3) triangles, one moved by each of the offsets.
+    """Return one copy of (T, 3, 3) triangles for each offset (x, y, z) in metres.
 
-    The offsets are broadcast against each other: `x=[0, 1], z=2` are two copies, both 2 m up.
+    The offsets are broadcast against each other: `x=[0, 1], z=2` gives two copies, both 2 m up.
     """
     offsets = np.stack(np.broadcast_arrays(x, y, z), axis=-1)
     return (triangles + offsets[..., None, None, :]).reshape(-1, 3, 3)
@@ -55,10 +62,17 @@ def tube(
     *,
     closed: bool = True,
 ) -> np.ndarray:
-    """Return the (4 sides, 3, 3) triangles of a round bar between two points.
+    """Return the triangles of a round bar between two points.
 
-    Its radius is `radius`, or goes from `radius` at the start to `end_radius` at the end. Without
-    its two ends, if it is not closed, it has (2 sides, 3, 3) triangles.
+    Args:
+        start, end: ends of its axis, metres.
+        radius: radius at the start, metres.
+        end_radius: radius at the end, metres; by default the same.
+        sides: number of flat sides that the bar has.
+        closed: whether the bar has its two end faces.
+
+    Returns:
+        (4 * sides, 3, 3), or (2 * sides, 3, 3) if the bar is not closed.
     """
     if end_radius is None:
         end_radius = radius
@@ -67,7 +81,7 @@ def tube(
     end_point = np.array(end, dtype=float)
     axis = (end_point - start_point) / np.linalg.norm(end_point - start_point)
 
-    # A circle about the axis, (sides, 3).
+    # The corners of a circle about the axis, (sides, 3).
     x, y, z = axis
     across = np.array([0, z, -y]) if abs(x) < 0.9 else np.array([-z, 0, x])
     across /= np.linalg.norm(across)
@@ -93,9 +107,12 @@ def tube(
 def prism(
     profile: Sequence[tuple[float, float]], width: float, top_width: float | None = None
 ) -> np.ndarray:
-    """Return the (4 n, 3, 3) triangles of a side view drawn out across y.
+    """Return the (4 * n, 3, 3) triangles of a side view extruded along y.
 
-    The profile has n corners (x, z) and is convex or nearly so. The width may differ at the top.
+    Args:
+        profile: n corners (x, z) of the side view, which is convex or nearly so.
+        width: width along y at the lowest corner, metres.
+        top_width: width along y at the highest corner, metres; by default the same.
     """
     if top_width is None:
         top_width = width
@@ -117,9 +134,10 @@ def prism(
 
 
 def loft(rings: np.ndarray) -> np.ndarray:
-    """Return the (2 n k, 3, 3) triangles of the closed body through (n, k, 3) rings of corners.
+    """Return the (2 * n * k, 3, 3) triangles of the closed body through (n, k, 3) rings of corners.
 
-    If each ring runs counter-clockwise, seen from the last one, so do the triangles from outside.
+    If the corners of each ring are counter-clockwise seen from the last ring, the corners of the
+    triangles are counter-clockwise seen from outside.
     """
     following = np.roll(rings, -1, axis=1)
     low = rings[:-1].reshape(-1, 3)
@@ -141,10 +159,10 @@ def planks(
     top: ArrayLike,
     y: ArrayLike = 0.0,
 ) -> np.ndarray:
-    """Return upright rectangles that face along y, as (2 n, 3, 3) triangles.
+    """Return the (2 * n, 3, 3) triangles of n upright rectangles that face along y.
 
-    The arguments are in metres and are broadcast against each other: `x` is the middle of each
-    rectangle, `bottom` and `top` are the heights of its edges.
+    The arguments are in metres and are broadcast against each other. `x` is the middle of each
+    rectangle, and `bottom` and `top` are the heights of its lower and its upper edge.
     """
     x, width, bottom, top, y = np.broadcast_arrays(x, width, bottom, top, y)
     left = (x - width / 2).ravel()
@@ -169,7 +187,7 @@ def turned(triangles: np.ndarray, yaw: float) -> np.ndarray:
 
 
 def moved(triangles: np.ndarray, at: Vector, yaw: float = 0.0) -> np.ndarray:
-    """Return (T, 3, 3) triangles turned by `yaw` radians about the z axis, then moved."""
+    """Return (T, 3, 3) triangles turned by `yaw` radians about the z axis, then moved by `at`."""
     return turned(triangles, yaw) + np.array(at)
 
 
@@ -182,9 +200,13 @@ def leaning(triangles: np.ndarray, x: float, y: float) -> np.ndarray:
 
 
 def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.ndarray:
-    """Return the (2 sides, 3, 3) triangles of a flat ring in the x-z plane, such as a wheel's rim.
+    """Return the (2 * sides, 3, 3) triangles of a flat ring in the x-z plane, such as a tyre.
 
-    `at` is its centre.
+    Args:
+        radius: outer radius, metres.
+        thickness: outer radius less inner radius, metres.
+        at: centre of the ring, metres.
+        sides: number of straight sides.
     """
     angle = np.arange(sides) * 2 * np.pi / sides
     circle = np.column_stack([np.cos(angle), np.zeros(sides), np.sin(angle)])
@@ -197,12 +219,15 @@ def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.nda
 
 
 def quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return the (2 n, 3, 3) triangles of n quadrangles, given lists of their corners in order."""
+    """Return the (2 * n, 3, 3) triangles of n quadrangles.
+
+    `a`, `b`, `c` and `d` are the (n, 3) corners in the order around each quadrangle.
+    """
     return np.concatenate([_triangles(a, b, c), _triangles(a, c, d)])
 
 
 def _triangles(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the (n, 3, 3) triangles between three lists of n corners."""
+    """Return n triangles, (n, 3, 3), from their (n, 3) corners."""
     return np.stack([a, b, c], axis=1)
 
 
@@ -229,10 +254,11 @@ def hull(
 
     Args:
         rng: draws the bumps.
-        centre, radii: centre and half axes of the hull in metres.
-        taper: share by which it is narrower at the top and wider at the bottom.
-        square: exponent of the shape; below 1 it is closer to a box.
-        fine: 320 triangles instead of 80.
+        centre: centre of the hull, metres.
+        radii: half the length of the hull along x, y and z, metres.
+        taper: share by which the hull is narrower at the top and wider at the bottom.
+        square: exponent of the shape: 1 is an ellipsoid; below 1, the hull is closer to a box.
+        fine: whether the hull has 320 triangles instead of 80.
     """
     corners, faces = _sphere(2 if fine else 1)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 
 def read_table(path: Path) -> dict[str, dict[str, Any]]:
-    """Read the rows of a TOML file by name; arrays become tuples."""
+    """Return the rows of a TOML file by name; arrays become tuples."""
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     for row in table.values():
         row.update({column: _without_lists(value) for column, value in row.items()})

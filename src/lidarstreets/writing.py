@@ -1,4 +1,4 @@
-"""Write simulated sequences on several processes, and continue where a call was stopped."""
+"""Write simulated sequences with several processes, and continue after an interruption."""
 
 import json
 import multiprocessing
@@ -17,20 +17,28 @@ import numpy as np
 
 from lidarstreets.drive import drive_street
 from lidarstreets.errors import SimulationError
-from lidarstreets.layouts import LAYOUTS, WRITING, write_whole
+from lidarstreets.layouts import LAYOUTS, WRITE_LOCK, write_whole
 from lidarstreets.sensing.lidar import require_embree, take_one_thread
-from lidarstreets.sensing.sensors import SENSORS, sensor_of
+from lidarstreets.sensing.sensors import LIDAR_MODELS, sensor_of
 
-Progress = Callable[[int, int], None]  # scans written, scans in all
+Progress = Callable[[int, int], None]  # called with the number of scans written, and of all scans
 # Environment variables that set the number of threads of the numerical libraries.
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# Folder with a file for each complete sequence: its settings, and what the layout keeps of it.
-MARKERS = ".simulation"
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# Folder with one file for each complete sequence: its settings and what the layout's tables need.
+MARKER_FOLDER = ".simulation"
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """One sequence to write."""
+    """One sequence to write.
+
+    Attributes:
+        out: the folder of all sequences.
+        sensor: name of the sensor in `LIDAR_MODELS`.
+        number: number of the sequence.
+        scans: number of its scans.
+        seed: seed of all sequences.
+    """
 
     out: Path
     sensor: str
@@ -40,13 +48,13 @@ class Sequence:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What determines the bytes of the sequence, together with its number."""
+        """The settings that, with the number of the sequence, determine the bytes of its files."""
         return {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
 
     @property
     def marker(self) -> Path:
         """The file that exists once the sequence is complete."""
-        return self.out / MARKERS / f"{self.number:04d}.json"
+        return self.out / MARKER_FOLDER / f"{self.number:04d}.json"
 
     @property
     def begun(self) -> Path:
@@ -73,21 +81,22 @@ def simulate(
     Args:
         out: folder to write to, in the layout of SemanticKITTI (HDL-64E), nuScenes-lidarseg
             (HDL-32E) or a robot with a YAML file (VLP-16).
-        sensor: name of a sensor in `SENSORS`.
-        sequences: number of sequences; each is another street.
+        sensor: name of a sensor in `LIDAR_MODELS`.
+        sequences: number of sequences, each in another street.
         scans: number of scans in each sequence.
         seed: seed of all randomness.
         first_sequence: number of the first sequence.
-        processes: number of sequences that are simulated in parallel; a script that asks for more
-            than one needs Python's `if __name__ == "__main__"`.
-        progress: called with the number of scans written and the number in all.
+        processes: number of processes, each of which simulates one sequence at a time. A script
+            that asks for more than one must guard its own code by `if __name__ == "__main__"`.
+        progress: called with the number of scans written so far and the number of all scans.
 
     Returns:
         The folder `out`.
 
     Raises:
-        SimulationError: if the sensor is unknown, a number is too small, embreex is missing, or the
-            folder holds a sequence with other settings, or one that was not simulated.
+        SimulationError: if the sensor is unknown, a number is too small, embreex is missing, the
+            folder cannot be written, or it holds a sequence that has other settings or that was
+            not simulated.
     """
     layout = LAYOUTS[sensor_of(sensor).layout]
     _check_at_least(1, sequences=sequences, scans=scans, processes=processes)
@@ -107,15 +116,19 @@ def simulate(
         done += written
         progress(done, scans * sequences)
 
-    # The layout's tables cover all sequences in the folder, also the sequences of earlier calls.
-    markers = sorted((out / MARKERS).glob("*.json"))
+    # The layout's tables cover all sequences in the folder, including sequences of earlier calls.
+    markers = sorted((out / MARKER_FOLDER).glob("*.json"))
     rows = [json.loads(path.read_text())["rows"] for path in markers]
     layout.complete(out, rows)
     return out
 
 
 def _is_complete(sequence: Sequence) -> bool:
-    """Return whether an earlier call has completed a sequence; raise if it has other settings."""
+    """Return whether an earlier call has completed a sequence.
+
+    Raises:
+        SimulationError: if it did so with other settings.
+    """
     if not sequence.marker.is_file():
         return False
 
@@ -134,22 +147,22 @@ def _check_own(sequence: Sequence) -> None:
     place, belongs_to_all = LAYOUTS[sensor_of(sequence.sensor).layout].place(
         sequence.out, sequence.number
     )
-    begun = (sequence.out / MARKERS).glob("*") if belongs_to_all else [sequence.begun]
+    begun = (sequence.out / MARKER_FOLDER).glob("*") if belongs_to_all else [sequence.begun]
     if os.path.lexists(place) and not any(path.exists() for path in begun):
         raise SimulationError(
-            f"{place}: expected a folder of simulated scans or none, found another one; "
+            f"{place}: expected simulated scans or nothing there, found something else; "
             "choose another folder"
         )
 
 
 def _write_sequences(sequences: list[Sequence], processes: int) -> Iterator[int]:
-    """Write sequences; yield the number of scans each time that some are written."""
+    """Write sequences; each time that scans are written, yield their number."""
     if processes <= 1:
         for sequence in sequences:
             yield from _write(sequence)
         return
 
-    # Spawned, as a fork of a process that has computed with torch may hang.
+    # Workers are spawned: a fork of a process that has computed with torch may hang.
     context = multiprocessing.get_context("spawn")
     lifeline, parents_end = context.Pipe(duplex=False)
     with ProcessPoolExecutor(processes, context, _start_worker, (lifeline,)) as pool:
@@ -166,12 +179,13 @@ def _write_sequences(sequences: list[Sequence], processes: int) -> Iterator[int]
 
 @contextmanager
 def _inherited_by_workers() -> Iterator[None]:
-    """Let processes started in this context compute with one thread and leave signals alone.
+    """Let processes started in this context compute with one thread and ignore Ctrl-C and SIGTERM.
 
-    Ctrl-C reaches all processes of a terminal. Workers end with their parent, see `_start_worker`.
+    Ctrl-C reaches all processes of a terminal, but workers end with their parent instead: see
+    `_start_worker`.
     """
-    variables = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+    variables = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
@@ -184,15 +198,16 @@ def _inherited_by_workers() -> Iterator[None]:
 
 
 def _start_worker(lifeline: Connection) -> None:
-    """Prepare a process of the pool: one thread, and an end as soon as its parent wants or dies.
+    """Prepare a worker: it computes with one thread, and ends when its parent says so or dies.
 
     Args:
-        lifeline: a pipe whose other end is closed by the parent, or by the system if it is killed.
+        lifeline: a pipe to the parent. The parent closes its end to stop the worker; if the parent
+            is killed, the system closes it.
     """
 
     def watch() -> None:
         lifeline.poll(None)
-        with WRITING:  # no file stays half-written
+        with WRITE_LOCK:  # a file that is being written is finished first
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -205,7 +220,7 @@ def _write_all(sequence: Sequence) -> int:
 
 def _write(sequence: Sequence) -> Iterator[int]:
     """Write one sequence; yield 1 after each scan."""
-    model = SENSORS[sequence.sensor]
+    model = LIDAR_MODELS[sequence.sensor]
     layout = LAYOUTS[model.layout](sequence.out, sequence.number)
     seed = np.random.SeedSequence((sequence.seed, sequence.number))
     write_whole(sequence.begun, b"")

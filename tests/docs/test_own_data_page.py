@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from amvnet.weights.file import load, save
-from lidarstreets import SENSORS
+from lidarstreets import LIDAR_MODELS
 
 from fixtures.commands import commands_of, run_cli
 from fixtures.own_scans import CLASSES, make_own_scans
@@ -73,7 +73,7 @@ def test_every_command_of_the_page_runs(
     # The sensor of the training scans is kept: +-15 degrees, brought to the height of the recipe.
     sensor = load("runs/new").training["range_net"]["sensor"]
     assert (sensor["fov_up"], sensor["fov_down"]) == pytest.approx((15, -15), abs=2)
-    assert sensor["height"] == 1.73 != SENSORS["vlp16"].height
+    assert sensor["height"] == 1.73 != LIDAR_MODELS["vlp16"].height
     assert "site_d" in Path("next.csv").read_text()
     assert Path("runs/new/curves.png").read_bytes().startswith(b"\x89PNG")
 

@@ -10,7 +10,7 @@ import amvnet
 import lidarstreets
 
 SHARED = {
-    "SENSORS",
+    "LIDAR_MODELS",
     "SimulationError",
     "drive_street",
     "simulate",

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarstreets import SENSORS, Drive, SimulatedScan, SimulationError, drive_street, simulate
+from lidarstreets import LIDAR_MODELS, Drive, SimulatedScan, SimulationError, drive_street, simulate
 from lidarstreets.sensing.sensors import LidarModel, draw_device
-from lidarstreets.streets.kinds import KINDS
+from lidarstreets.streets.kinds import STREET_KINDS
 
 # Raw ids of SemanticKITTI.
 THING_IDS = {10, 11, 13, 15, 18, 20, 30, 31, 32}
@@ -22,7 +22,7 @@ STUFF_IDS = {40, 44, 48, 49, 50, 51, 52, 60, 70, 71, 72, 80, 81, 99}
 MOVING_IDS = {252, 253, 254, 255, 257, 258, 259}
 CAR_IDS = [10, 252]
 ROAD_IDS = [40, 60]
-HDL64E = SENSORS["hdl64e"]
+HDL64E = LIDAR_MODELS["hdl64e"]
 
 
 def exact_device(sensor: LidarModel) -> LidarModel:
@@ -107,7 +107,7 @@ def test_progress_counts_every_scan(tmp_path: Path) -> None:
 def test_values_are_in_range(scans: list[SimulatedScan]) -> None:
     # The points are corrected to the middle of the rotation, so the sensor was at most half a
     # rotation's way from there.
-    fastest = Drive().speed[1] * 1.2 * max(kind.speed for kind in KINDS.values())
+    fastest = Drive().speed[1] * 1.2 * max(kind.speed for kind in STREET_KINDS.values())
     moved = fastest * HDL64E.rotation_period / 2
     for scan in scans:
         assert scan.points.dtype == np.float32
@@ -124,13 +124,13 @@ def test_values_are_in_range(scans: list[SimulatedScan]) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("name", LIDAR_MODELS)
 def test_without_motion_every_point_lies_on_its_beam_within_the_sensors_ranges(
     name: str, seed: int
 ) -> None:
     """A rotation that takes no time leaves nothing to correct."""
     pytest.importorskip("embreex")
-    sensor = exact_device(replace(SENSORS[name], rotation_period=0.0, range_error=0.0))
+    sensor = exact_device(replace(LIDAR_MODELS[name], rotation_period=0.0, range_error=0.0))
     beams = np.array(sensor.elevations)[::-1]
     heights = np.interp(beams, *np.transpose(sensor.origins))
     for scan in drive_street(sensor, 2, np.random.SeedSequence(seed)):

@@ -35,7 +35,7 @@ from amvnet.sensors.lidars import (
 from amvnet.sensors.measure import MEASURED, raise_points
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import save
-from lidarstreets.sensing.sensors import SENSORS as SIMULATED_SENSORS
+from lidarstreets import LIDAR_MODELS
 
 from fixtures.commands import fails, files, run_cli
 from fixtures.scan_writers import pcd_bytes, write_bag1
@@ -185,7 +185,7 @@ def test_axes_do_not_mirror(axes: Any) -> None:
 
 
 def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
-    points, _ = place(SIMULATED_SENSORS["hdl64e"].elevations, 1.73)
+    points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
     weights = replace(fresh_weights(), sensor="hdl64e")
     scan = normaliser_for(weights)(make_cloud(points), "a")
     np.testing.assert_array_equal(scan.points, points)
@@ -259,7 +259,7 @@ def test_what_was_assumed_is_said_once_for_a_source() -> None:
 
 
 def test_the_sensor_of_the_training_is_said_to_be_familiar_and_in_place() -> None:
-    points, _ = place(SIMULATED_SENSORS["hdl64e"].elevations, 1.73)
+    points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
     normaliser, lines = make_normaliser()
     normaliser(make_cloud(points), "drive")
     assert "no such sensor" not in lines[0]
@@ -293,7 +293,7 @@ def test_scans_of_two_robots_in_one_source_get_their_own_heights() -> None:
 
 @pytest.mark.parametrize("up", [1.5, 1.73, 2.0])
 def test_a_scan_whose_origin_is_on_the_ground_or_below_is_moved(up: float) -> None:
-    points, _ = place(SIMULATED_SENSORS["hdl64e"].elevations, 1.73)
+    points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
     raised = points + np.array([0, 0, up, 0], np.float32)
 
     normaliser, _ = make_normaliser()
@@ -393,7 +393,7 @@ def test_wrong_options_are_named(tmp_path: Path) -> None:
 
 def test_sensors_are_described_as_they_are_simulated() -> None:
     """The field of view is that of the points, seen from the origin of the coordinates."""
-    for name, simulated in SIMULATED_SENSORS.items():
+    for name, simulated in LIDAR_MODELS.items():
         sensor = KNOWN_SENSORS[name]
         ends = np.array([simulated.elevations[0], simulated.elevations[-1]])
         heights = np.interp(ends, *np.transpose(simulated.origins))
@@ -406,7 +406,7 @@ def test_sensors_are_described_as_they_are_simulated() -> None:
         assert sensor.fov_down == pytest.approx(bottom, abs=0.5)
         if name in HEIGHTS:  # the sensor of weights is mounted at one height
             assert HEIGHTS[name] == simulated.height
-    assert set(HEIGHTS) <= set(SIMULATED_SENSORS)
+    assert set(HEIGHTS) <= set(LIDAR_MODELS)
 
 
 # --- on the command line

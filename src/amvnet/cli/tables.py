@@ -20,7 +20,7 @@ from amvnet.models.methods import title_of
 from amvnet.progress import counted
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import built_in, load
-from lidarstreets import SENSORS as SIMULATED_SENSORS
+from lidarstreets import LIDAR_MODELS
 
 
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
@@ -179,7 +179,7 @@ def sensors_table() -> Table:
         table.add_row(
             name, str(sensor.beams), f"{sensor.fov_up:+g} degrees", f"{sensor.fov_down:+g} degrees"
         )
-    simulated = ", ".join(SIMULATED_SENSORS)
+    simulated = ", ".join(LIDAR_MODELS)
     table.caption = f"amvnet simulate has the sensors {simulated}"
     return table
 

@@ -1,11 +1,11 @@
-"""Meshes of houses, halls and sheds.
+"""Make meshes of houses, halls and sheds.
 
-The front of a building faces -y; its walls begin below the ground, so that a slope leaves no gap.
+The front of a building faces -y. Its walls begin below the ground, so that a slope leaves no gap.
 """
 
 import numpy as np
 
-from lidarstreets.bodies.facades import FOOT, Facade, draw_facade, plain_wall, wall
+from lidarstreets.bodies.facades import BELOW_GROUND, Facade, draw_facade, plain_wall, wall
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place
 from lidarstreets.solids import box, copies, planks, prism, tube
@@ -14,7 +14,15 @@ from lidarstreets.solids import box, copies, planks, prism, tube
 def building(
     rng: np.random.Generator, width: float, depth: float, height: float, flat: bool
 ) -> Mesh:
-    """Return a house, `width` along x and `depth` along y, with a flat or a pitched roof."""
+    """Return a house with a flat or a pitched roof.
+
+    Args:
+        rng: draws its look, wings, dormers and garage.
+        width: width along x, metres.
+        depth: depth along y, metres.
+        height: height of the walls, metres.
+        flat: whether the roof is flat.
+    """
     facade = draw_facade(rng, height)
     parts = [_walls(rng, facade, width, depth, height)]
     parts.append(part([_roof(rng, width, depth, height, flat)], Surface.ROOF_TILE, Label.BUILDING))
@@ -42,7 +50,7 @@ def building(
 def _walls(
     rng: np.random.Generator, facade: Facade, width: float, depth: float, height: float
 ) -> Mesh:
-    """Return four walls, the one at the back without windows."""
+    """Return four walls; the wall at the back has no windows."""
     return join(
         place(wall(rng, facade, width, height), 0, -depth / 2, 0, 0),
         place(wall(rng, facade, depth, height), -width / 2, 0, 0, -np.pi / 2),
@@ -54,7 +62,7 @@ def _walls(
 def _roof(
     rng: np.random.Generator, width: float, depth: float, height: float, flat: bool
 ) -> np.ndarray:
-    """Return a flat roof, or a hipped or gabled one."""
+    """Return the triangles of a flat, hipped or gabled roof."""
     if flat:
         return box((width + 0.3, depth + 0.3, 0.5), (0, 0, height - 0.2))
 
@@ -130,7 +138,7 @@ def canopy(rng: np.random.Generator) -> Mesh:
 
 
 def hall(rng: np.random.Generator, width: float, depth: float, height: float) -> Mesh:
-    """Return an industrial hall: ribbed walls, a band of windows and gates."""
+    """Return an industrial hall with ribbed walls, a band of windows and gates; see `building`."""
     pitch = rng.uniform(0.25, 1.0)
     rib = rng.choice([0.0, 0.04, 0.12])
 
@@ -143,7 +151,9 @@ def hall(rng: np.random.Generator, width: float, depth: float, height: float) ->
     ):
         x = (np.arange(int(length / pitch) + 1) + 0.5) * pitch - length / 2
         y = np.where(np.arange(len(x)) % 2 == 0, 0.0, rib)
-        sheets = part([planks(x, pitch, -FOOT, height, y)], Surface.METAL, Label.BUILDING, tint=0.8)
+        sheets = part(
+            [planks(x, pitch, -BELOW_GROUND, height, y)], Surface.METAL, Label.BUILDING, tint=0.8
+        )
         gates = planks(rng.uniform(-0.3, 0.3, 2) * length, rng.uniform(2.5, 4.5), -0.2, 3.6, -0.05)
         band = planks(0, length * 0.9, height - 1.6, height - 0.7, -0.04)
         side = join(
@@ -181,11 +191,12 @@ def greenhouse(rng: np.random.Generator) -> Mesh:
 def church(rng: np.random.Generator) -> Mesh:
     """Return a nave with a tower."""
     height = rng.uniform(7, 11)
-    nave = box((10, 20, height + FOOT), (0, 2, -FOOT))
+    nave = box((10, 20, height + BELOW_GROUND), (0, 2, -BELOW_GROUND))
     buttresses = copies(
-        box((11.4, 0.9, height * 0.7 + FOOT), (0, 0, -FOOT)), y=np.linspace(-6, 11, 5)
+        box((11.4, 0.9, height * 0.7 + BELOW_GROUND), (0, 0, -BELOW_GROUND)),
+        y=np.linspace(-6, 11, 5),
     )
-    tower = box((6, 6, 24 + FOOT), (0, -10, -FOOT))
+    tower = box((6, 6, 24 + BELOW_GROUND), (0, -10, -BELOW_GROUND))
     roof = box((11, 21, 7), (0, 2, height), top=(0.02, 1.0))
 
     return join(
@@ -195,10 +206,16 @@ def church(rng: np.random.Generator) -> Mesh:
 
 
 def gable_barn(rng: np.random.Generator, width: float, depth: float, height: float) -> Mesh:
-    """Return a long barn whose gable faces along y, with a gate in it."""
+    """Return a long barn whose gable faces -y and has a gate; see `building`."""
     half = width / 2
     ridge = height + width * rng.uniform(0.15, 0.3)
-    profile = [(-half, -FOOT), (half, -FOOT), (half, height), (0, ridge), (-half, height)]
+    profile = [
+        (-half, -BELOW_GROUND),
+        (half, -BELOW_GROUND),
+        (half, height),
+        (0, ridge),
+        (-half, height),
+    ]
     surface = (Surface.PLASTER, Surface.WOOD, Surface.BRICK)[rng.integers(3)]
     gate = planks(rng.uniform(-0.2, 0.2) * width, 3.2, 0, 3.0, -depth / 2 - 0.05)
     return join(

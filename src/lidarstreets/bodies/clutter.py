@@ -1,6 +1,6 @@
-"""Meshes of what SemanticKITTI leaves without a class: bins, cabinets, benches and shelters.
+"""Make meshes of what SemanticKITTI leaves without a class: bins, benches, shelters and more.
 
-They are labelled other-object or other-structure, which a benchmark counts as unlabelled.
+They are labelled other-object or other-structure. SemanticKITTI counts both as unlabelled.
 """
 
 import numpy as np
@@ -10,16 +10,16 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Maker, Mesh, join, part
 from lidarstreets.solids import box, copies, hull, moved, planks, tube
 
-FOOT = 0.3  # metres by which objects reach below the ground, so that a slope leaves no gap
+BELOW_GROUND = 0.3  # depth of objects below the ground, so that a slope leaves no gap, metres
 
 
 def _object(solids: list[np.ndarray], surface: Surface, rng: np.random.Generator) -> Mesh:
-    """Return solids as an other-object of a random brightness."""
+    """Return solids as one mesh with the class other-object and a random brightness."""
     return part(solids, surface, Label.OTHER_OBJECT, tint=rng.normal(scale=0.6))
 
 
 def _structure(solids: list[np.ndarray], surface: Surface, rng: np.random.Generator) -> Mesh:
-    """Return solids as an other-structure of a random brightness."""
+    """Return solids as one mesh with the class other-structure and a random brightness."""
     return part(solids, surface, Label.OTHER_STRUCTURE, tint=rng.normal(scale=0.6))
 
 
@@ -46,8 +46,8 @@ def cabinet(rng: np.random.Generator) -> Mesh:
     if rng.random() < 0.1:
         size = (rng.uniform(2, 3), rng.uniform(1.6, 2.4), rng.uniform(1.5, 2.3))
         return _structure([box(size, (0, 0, -0.05))], Surface.PLASTER, rng)
-    size = (rng.uniform(0.4, 1.8), rng.uniform(0.25, 0.5), rng.uniform(0.7, 1.6) + FOOT)
-    return _object([box(size, (0, 0, -FOOT))], Surface.PLASTER, rng)
+    size = (rng.uniform(0.4, 1.8), rng.uniform(0.25, 0.5), rng.uniform(0.7, 1.6) + BELOW_GROUND)
+    return _object([box(size, (0, 0, -BELOW_GROUND))], Surface.PLASTER, rng)
 
 
 def bench(rng: np.random.Generator) -> Mesh:
@@ -66,7 +66,7 @@ def column(rng: np.random.Generator) -> Mesh:
     """Return an advertising column, a lit poster or a phone box."""
     if rng.random() < 0.4:
         height = rng.uniform(2.4, 3.4)
-        solids = [tube((0, 0, -FOOT), (0, 0, height), rng.uniform(0.5, 0.7), sides=12)]
+        solids = [tube((0, 0, -BELOW_GROUND), (0, 0, height), rng.uniform(0.5, 0.7), sides=12)]
         return _object(solids, Surface.PLASTER, rng)
     if rng.random() < 0.5:
         poster = box((0.25, rng.uniform(1.2, 2.8), 1.9), (0, 0, 0.7))
@@ -89,7 +89,7 @@ def heap(rng: np.random.Generator) -> Mesh:
     if kind < 0.4:
         size = rng.uniform(0.6, 3.0, size=2)
         mound = hull(rng, (0, 0, -0.1), (size[0], size[1], rng.uniform(0.4, 1.6)), fine=False)
-        mound[..., 2] = np.maximum(mound[..., 2], -FOOT)
+        mound[..., 2] = np.maximum(mound[..., 2], -BELOW_GROUND)
         surface = Surface.GRAVEL if rng.random() < 0.5 else Surface.STONE
         return _object([mound], surface, rng)
     if kind < 0.7:
@@ -141,7 +141,7 @@ def structure(rng: np.random.Generator) -> Mesh:
     if kind < 0.3:
         y = np.array([-0.5, 0.5]) * rng.uniform(1.5, 3.5)
         x = np.linspace(-length / 2, length / 2, 4)
-        posts = box((0.12, 0.12, height + FOOT), (0, 0, -FOOT))
+        posts = box((0.12, 0.12, height + BELOW_GROUND), (0, 0, -BELOW_GROUND))
         beam = box((0.08, y[1] - y[0] + 0.6, 0.14), (0, 0, height))
         return _structure(
             [copies(posts, x=x[:, None], y=y), copies(beam, x=np.append(x, x + 0.4))],
@@ -155,7 +155,11 @@ def structure(rng: np.random.Generator) -> Mesh:
             _structure([board], Surface.PLASTER, rng), _structure([posts], Surface.METAL, rng)
         )
     if kind < 0.7:
-        ramp = box((length, 1.6, 1.1 + FOOT), (0, 0, -FOOT), top=(rng.uniform(0.3, 1.0), 1.0))
+        ramp = box(
+            (length, 1.6, 1.1 + BELOW_GROUND),
+            (0, 0, -BELOW_GROUND),
+            top=(rng.uniform(0.3, 1.0), 1.0),
+        )
         rail = planks(0, length, np.array([1.5, 1.95]), np.array([1.55, 2.0]), -0.75)
         return _structure([ramp, rail], Surface.PLASTER, rng)
     if kind < 0.85:
@@ -166,7 +170,7 @@ def structure(rng: np.random.Generator) -> Mesh:
         poles = copies(pole, x=x[:, None], y=[-0.35, 0.35])
         return _structure([poles, decks, rails], Surface.METAL, rng)
 
-    block = box((length, rng.uniform(1.0, 3.0), height + FOOT), (0, 0, -FOOT))
+    block = box((length, rng.uniform(1.0, 3.0), height + BELOW_GROUND), (0, 0, -BELOW_GROUND))
     return _structure([block], Surface.PLASTER, rng)
 
 
@@ -236,7 +240,7 @@ def steps(rng: np.random.Generator) -> Mesh:
 
 
 def bridge(rng: np.random.Generator, width: float) -> Mesh:
-    """Return a bridge over a road that is `width` metres wide, along y: abutments and a deck."""
+    """Return the abutments and the deck of a bridge, which spans `width` metres along y."""
     depth = rng.uniform(4, 14)
     height = rng.uniform(4.6, 5.8)
     wall = box((depth, 1.0, height + 1), (0, 0, -1))

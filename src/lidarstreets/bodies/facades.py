@@ -1,4 +1,4 @@
-"""Meshes of the walls of houses, with windows, doors, balconies and what hangs on them.
+"""Make meshes of the walls of houses, with windows, doors, balconies and what hangs on them.
 
 A facade lies along x at y = 0 and faces -y.
 """
@@ -12,8 +12,8 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, leaning, moved, planks, tube
 
-FOOT = 1.5  # metres by which walls reach below the ground, so that a slope leaves no gap
-# Metres above which a facade has no windows, as few pulses arrive there.
+BELOW_GROUND = 1.5  # depth of walls below the ground, so that a slope leaves no gap, metres
+# Largest height of a window, metres: few pulses arrive above it.
 HIGHEST_WINDOW = 9.0
 
 
@@ -22,16 +22,17 @@ class Facade:
     """The measures and the look of the walls of one house; lengths are in metres.
 
     Attributes:
-        surface: of the walls.
+        surface: surface of the walls.
         storey: height of a storey.
         pitch: distance between two windows.
         window: width and height of a window.
         recess: depth of the windows in the wall.
-        plinth: height of a plinth that sticks out; 0 is none.
-        shutters, timber: whether it has them.
+        plinth: height of a plinth that sticks out; 0 if there is none.
+        shutters: whether the windows have shutters.
+        timber: whether the wall has a timber frame.
         patchy: standard deviation of the tint between the parts of a wall.
         shop: whether the ground floor is one band of windows.
-        balconies: chance of one at each window above the ground floor.
+        balconies: chance of a balcony at each window above the ground floor.
     """
 
     surface: Surface
@@ -68,13 +69,13 @@ def draw_facade(rng: np.random.Generator, height: float) -> Facade:
 
 
 def plain_wall(facade: Facade, width: float, height: float) -> Mesh:
-    """Return a wall without windows."""
-    wall = planks(0, width, -FOOT, height)
+    """Return a wall without windows, `width` metres along x."""
+    wall = planks(0, width, -BELOW_GROUND, height)
     return part([wall], facade.surface, Label.BUILDING)
 
 
 def wall(rng: np.random.Generator, facade: Facade, width: float, height: float) -> Mesh:
-    """Return a wall with windows in every storey and what hangs on it."""
+    """Return a wall, `width` metres along x, with windows in every storey and what hangs on it."""
     margin = facade.window[0] / 2 + 0.3
     count = int((width - 2 * margin) / facade.pitch) + 1
     if width < 2 * margin or height < 2.3:
@@ -84,7 +85,7 @@ def wall(rng: np.random.Generator, facade: Facade, width: float, height: float) 
     sills = np.arange(0.9, min(height, HIGHEST_WINDOW) - facade.window[1] - 0.1, facade.storey)
 
     parts = []
-    bottom = -FOOT
+    bottom = -BELOW_GROUND
 
     for storey, sill in enumerate(sills):
         low = sill
@@ -117,7 +118,17 @@ def _storey(
     levels: tuple[float, float, float],
     opening: float,
 ) -> list[Mesh]:
-    """Return the wall and the windows between three heights: below, sill and top of the windows."""
+    """Return the wall and the windows of one storey.
+
+    Args:
+        rng: draws the tints of the parts of the wall.
+        facade: the look of the wall.
+        width: width of the wall, metres.
+        middles: x of the middles of the windows, metres.
+        levels: heights of the lower edge of the storey, of the sills and of the tops of the
+            windows, metres.
+        opening: width of a window, metres.
+    """
     bottom, sill, top = levels
     edges = np.concatenate([[-width / 2], np.repeat(middles, 2), [width / 2]])
     edges[1:-1:2] -= opening / 2
@@ -152,7 +163,7 @@ def _shutters(facade: Facade, middles: np.ndarray, levels: tuple[float, float]) 
 
 
 def _balconies(rng: np.random.Generator, middles: np.ndarray, floor: float) -> list[Mesh]:
-    """Return balconies at some windows of a storey whose floor is at a height."""
+    """Return balconies at the windows `middles` (x) of a storey whose floor is `floor` high."""
     if not len(middles):
         return []
 
@@ -200,30 +211,33 @@ def _extras(rng: np.random.Generator, facade: Facade, width: float, height: floa
 def _annexes(
     rng: np.random.Generator, facade: Facade, width: float, height: float
 ) -> list[np.ndarray]:
-    """Return the plinth, a porch on posts, a bay and a wing of a wall, (T, 3, 3) each."""
+    """Return the plinth, a porch on posts, a bay and a wing of a wall: (T, 3, 3) triangles each.
+
+    The wall may lack any of them.
+    """
     solids = []
     x = rng.uniform(-0.35, 0.35) * width
 
     if facade.plinth:
-        solids.append(box((width + 0.1, 0.12, FOOT + facade.plinth), (0, 0, -FOOT)))
+        solids.append(box((width + 0.1, 0.12, BELOW_GROUND + facade.plinth), (0, 0, -BELOW_GROUND)))
     if rng.random() < 0.15:
-        post = box((0.15, 0.15, 2.4 + FOOT), (0, -1.3, -FOOT))
+        post = box((0.15, 0.15, 2.4 + BELOW_GROUND), (0, -1.3, -BELOW_GROUND))
         solids.append(copies(post, x=[x - 1.2, x + 1.2]))
         solids.append(box((2.8, 1.6, 0.2), (x, -0.75, 2.4)))
     if rng.random() < 0.2:
         reach = rng.uniform(0.5, 1.2)
         bay_height = rng.uniform(2.4, max(height, 2.5))
-        size = (rng.uniform(1.5, 3.5), 2 * reach, bay_height + FOOT)
-        solids.append(box(size, (-x, 0, -FOOT)))
+        size = (rng.uniform(1.5, 3.5), 2 * reach, bay_height + BELOW_GROUND)
+        solids.append(box(size, (-x, 0, -BELOW_GROUND)))
     if rng.random() < 0.08:
         reach = rng.uniform(2, 4)
-        size = (width * 0.4, 2 * reach, height * rng.uniform(0.4, 0.8) + FOOT)
-        solids.append(box(size, (x, 0, -FOOT)))
+        size = (width * 0.4, 2 * reach, height * rng.uniform(0.4, 0.8) + BELOW_GROUND)
+        solids.append(box(size, (x, 0, -BELOW_GROUND)))
     return solids
 
 
 def _spaced(width: float, pitch: float) -> np.ndarray:
-    """Return the middles of beams that are evenly spaced over a wall, (n,)."""
+    """Return x of the n middles of beams that are evenly spaced over a wall: (n,)."""
     return np.linspace(-width / 2, width / 2, max(2, round(width / pitch) + 1))
 
 

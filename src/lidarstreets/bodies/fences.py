@@ -1,7 +1,7 @@
-"""Meshes of fences, walls, railings and noise barriers, which SemanticKITTI labels fence.
+"""Make meshes of fences, walls, railings and noise barriers, which SemanticKITTI labels fence.
 
-A `Fence` is one kind with all its measures; its segments lie along x and look alike, so that they
-can be lined up along a boundary.
+A `Fence` is one kind of fence with all its measures. Its segments lie along x and look alike, so
+that they form a line along a boundary.
 """
 
 from collections.abc import Callable
@@ -17,35 +17,32 @@ from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, leaning, loft, planks, prism, tube
 from lidarstreets.tables import read_table
 
-SHARES = read_table(Path(__file__).with_suffix(".toml"))
-FOOT = 0.5  # metres by which fences reach below the ground, so that a slope leaves no gap
-POROUS_THICKNESS = 0.04  # metres: of wire meshes and lattices
-# Section (y, z) of the beam of a guard rail, which has two waves, in metres; its height, and the
-# distance between two beams, one above the other.
+FENCE_SHARES = read_table(Path(__file__).with_suffix(".toml"))
+BELOW_GROUND = 0.5  # depth of fences below the ground, so that a slope leaves no gap, metres
+POROUS_THICKNESS = 0.04  # thickness of wire meshes and lattices, metres
+# Section of the beam of a guard rail, which has two waves: corners (y, z) in metres.
 BEAM = (
     (0.0, 0.0), (-0.06, 0.05), (-0.06, 0.11), (0.0, 0.155), (-0.06, 0.2), (-0.06, 0.26),
     (0.0, 0.31), (0.02, 0.155),
 )  # fmt: skip
-BEAM_HEIGHT = 0.31
-BEAM_PITCH = 0.42
+BEAM_HEIGHT = 0.31  # height of the section of a beam, metres
+BEAM_PITCH = 0.42  # distance between two beams, one above the other, metres
 
 
 @dataclass(frozen=True)
 class Fence:
-    """One kind of fence with all its measures, which is drawn segment by segment.
-
-    Lengths are in metres.
+    """One kind of fence with all its measures, made segment by segment. Lengths are in metres.
 
     Attributes:
-        kind: one of `KINDS`.
-        height: above the ground.
+        kind: kind of fence, a key of `FENCE_KINDS`.
+        height: height above the ground.
         pitch: distance between two boards, bars or stones.
-        gap: open share between boards; the share of the pulses that pass a mesh.
-        surface: of boards and walls.
-        lean: metres that it is off the vertical, for each metre of height.
+        gap: open share between boards, and share of the pulses that pass a wire mesh; 0 to 1.
+        surface: surface of boards and walls.
+        lean: distance from the vertical for each metre of height.
         uneven: how far boards and stones are out of line.
         overgrown: chance that plants grow through a segment.
-        tint: as in `Mesh`.
+        tint: tint, as in `Mesh`.
     """
 
     kind: str
@@ -59,23 +56,23 @@ class Fence:
     tint: float
 
     def solid(self, solids: list[np.ndarray], surface: Surface | None = None) -> Mesh:
-        """Return parts of the fence that let no pulse through; (T, 3, 3) triangles each."""
+        """Return parts of the fence that no pulse passes, from (T, 3, 3) triangles of each."""
         triangles = leaning(np.concatenate(solids), 0, self.lean)
         surface = self.surface if surface is None else surface
         return part([triangles], surface, Label.FENCE, tint=self.tint)
 
     def segment(self, rng: np.random.Generator, length: float) -> Mesh:
         """Return a piece of the fence, `length` metres along x."""
-        mesh = KINDS[self.kind].make(self, rng, length)
+        mesh = FENCE_KINDS[self.kind].make(self, rng, length)
         if rng.random() < self.overgrown:
             mesh = join(mesh, _creepers(rng, self, length))
         return mesh
 
 
 def draw_fence(rng: np.random.Generator, shares: dict[str, float]) -> Fence:
-    """Draw a kind of fence by the shares of the kinds, and its measures."""
+    """Draw a kind of fence and its measures. `shares` gives each kind its share."""
     kind = weighted_choice(rng, shares)
-    surfaces = KINDS[kind].surfaces
+    surfaces = FENCE_KINDS[kind].surfaces
     if surfaces is WOODEN:
         surface = Surface.WOOD if rng.random() < 0.85 else Surface.PLASTIC
     else:
@@ -85,7 +82,7 @@ def draw_fence(rng: np.random.Generator, shares: dict[str, float]) -> Fence:
 
     return Fence(
         kind=kind,
-        height=float(rng.uniform(*KINDS[kind].height)),
+        height=float(rng.uniform(*FENCE_KINDS[kind].height)),
         pitch=float(rng.uniform(0.09, 0.22)),
         gap=float(rng.uniform(0.0, 0.55) if kind != "mesh" else rng.uniform(0.55, 0.93)),
         surface=surface,
@@ -97,7 +94,10 @@ def draw_fence(rng: np.random.Generator, shares: dict[str, float]) -> Fence:
 
 
 def _creepers(rng: np.random.Generator, fence: Fence, length: float) -> Mesh:
-    """Return leaves that grow along a fence, or through it: people label those as the fence."""
+    """Return leaves that grow through a fence or along it.
+
+    Leaves that grow through a fence have its class, as people label them.
+    """
     if rng.random() < 0.5:
         leaves = bank(rng, length, "box", (rng.uniform(0.1, 0.4), fence.height), 0.05, step=0.9)
         return part([leaves], Surface.LEAF, Label.FENCE, rng.uniform(0.03, 0.3), tint=fence.tint)
@@ -111,13 +111,13 @@ def _creepers(rng: np.random.Generator, fence: Fence, length: float) -> Mesh:
 
 def _posts(length: float, height: float, radius: float = 0.04, y: float = 0.0) -> np.ndarray:
     """Return posts at both ends of a segment and, if it is long, in its middle."""
-    post = tube((0, 0, -FOOT), (0, 0, height), radius, sides=4)
+    post = tube((0, 0, -BELOW_GROUND), (0, 0, height), radius, sides=4)
     count = 2 if length < 3.5 else 3
     return copies(post, x=np.linspace(-length / 2, length / 2, count), y=y)
 
 
 def _middles(length: float, pitch: float) -> np.ndarray:
-    """Return the middles of boards along a segment, (n,)."""
+    """Return x of the n middles of boards along a segment: (n,)."""
     count = max(1, round(length / pitch))
     return (np.arange(count) + 0.5) / count * length - length / 2
 
@@ -165,7 +165,7 @@ def _beams(length: float, heights: np.ndarray, thickness: float, y: float = 0.02
 def _porous(
     fence: Fence, length: float, bottom: float, top: float, surface: Surface, passing: float
 ) -> Mesh:
-    """Return an upright sheet that lets a share of the head-on pulses pass."""
+    """Return an upright sheet; the share `passing` of the pulses that hit it head-on pass."""
     sheet = box((length, POROUS_THICKNESS, top - bottom), (0, 0, bottom))
     depth = POROUS_THICKNESS / -np.log(passing)
     return part(
@@ -180,7 +180,7 @@ def _mesh(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     sheet = _porous(fence, length, 0.03, fence.height, fence.surface, passing=fence.gap)
     parts = [fence.solid([posts, wires]), sheet]
     if fence.pitch < 0.12:
-        base = box((length, 0.12, 0.15 + FOOT), (0, 0, -FOOT))
+        base = box((length, 0.12, 0.15 + BELOW_GROUND), (0, 0, -BELOW_GROUND))
         parts.append(fence.solid([base], Surface.PLASTER))
     return join(*parts)
 
@@ -192,7 +192,7 @@ def _lattice(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 
 
 def _railing(fence: Fence, rng: np.random.Generator, length: float, foot: float = 0.0) -> Mesh:
-    """Return thin upright bars between two beams; they begin `foot` metres above the ground."""
+    """Return thin upright bars between two beams, `foot` metres above the ground."""
     rise = max(fence.height - foot, 0.4)
     x = _middles(length, max(fence.pitch, 0.11))
     bars = planks(x, rng.uniform(0.014, 0.03), foot + 0.08, foot + rise)
@@ -215,7 +215,7 @@ def _rails(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 
 
 def _wire(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    """Return wires between wooden posts: most pulses pass."""
+    """Return wires between wooden posts, which most pulses pass."""
     sheet = _porous(fence, length, 0.2, fence.height, Surface.METAL, passing=rng.uniform(0.9, 0.97))
     return join(fence.solid([_posts(length, fence.height, rng.uniform(0.03, 0.07))]), sheet)
 
@@ -223,12 +223,12 @@ def _wire(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 def _wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     """Return a garden wall with a coping and perhaps a pillar."""
     thickness = 0.15 + fence.pitch
-    solids = [box((length, thickness, fence.height + FOOT), (0, 0, -FOOT))]
+    solids = [box((length, thickness, fence.height + BELOW_GROUND), (0, 0, -BELOW_GROUND))]
     if fence.gap < 0.35:
         solids.append(box((length, thickness + 0.08, 0.08), (0, 0, fence.height)))
     if fence.gap < 0.15:
-        pillar = (0.4, thickness + 0.12, fence.height + FOOT + 0.15)
-        solids.append(box(pillar, (-length / 2, 0, -FOOT)))
+        pillar = (0.4, thickness + 0.12, fence.height + BELOW_GROUND + 0.15)
+        solids.append(box(pillar, (-length / 2, 0, -BELOW_GROUND)))
     return fence.solid(solids)
 
 
@@ -236,7 +236,7 @@ def _stone_wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     """Return a wall of rough stones, out of line by a few centimetres."""
     half = 0.15 + fence.pitch
     middle = 0.5 * fence.height
-    flank = np.array([(half, -FOOT), (half, middle), (0.8 * half, fence.height)])
+    flank = np.array([(half, -BELOW_GROUND), (half, middle), (0.8 * half, fence.height)])
     section = np.concatenate([flank, flank[::-1] * (-1, 1)])
     count = max(2, round(length / 0.35)) + 1
     rings = np.empty((count, len(section), 3))
@@ -246,9 +246,11 @@ def _stone_wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 
 
 def _wall_and_railing(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    """Return a low wall that carries a railing, or boards in place of it."""
+    """Return a low wall that carries a railing or boards."""
     low = fence.height * (0.2 + fence.gap)
-    wall = fence.solid([box((length, 0.15 + fence.pitch, low + FOOT), (0, 0, -FOOT))])
+    wall = fence.solid(
+        [box((length, 0.15 + fence.pitch, low + BELOW_GROUND), (0, 0, -BELOW_GROUND))]
+    )
     if fence.uneven < 0.006:
         return join(wall, _railing(fence, rng, length, foot=low))
 
@@ -257,8 +259,11 @@ def _wall_and_railing(fence: Fence, rng: np.random.Generator, length: float) -> 
 
 
 def _panels(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    panel = box((length, 0.05, fence.height + FOOT), (0, 0, -FOOT))
-    posts = copies(box((0.14, 0.16, fence.height + FOOT + 0.08), (0, 0, -FOOT)), x=[-length / 2])
+    panel = box((length, 0.05, fence.height + BELOW_GROUND), (0, 0, -BELOW_GROUND))
+    posts = copies(
+        box((0.14, 0.16, fence.height + BELOW_GROUND + 0.08), (0, 0, -BELOW_GROUND)),
+        x=[-length / 2],
+    )
     bands = _beams(length, np.array([0.33, 0.66]) * fence.height, 0.05, -0.03)
     return fence.solid([panel, posts, bands])
 
@@ -269,14 +274,20 @@ def _screen(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 
 
 def guard_rail(length: float, height: float = 0.75, beams: int = 1) -> Mesh:
-    """Return a segment of the crash barrier along a fast road; its upper beam is at `height`."""
+    """Return a segment of a steel crash barrier along x.
+
+    Args:
+        length: length of the segment, metres.
+        height: height of the upper edge of the lower beam, metres.
+        beams: number of beams, 1 or 2.
+    """
     profile = [(y, z + height - BEAM_HEIGHT) for y, z in BEAM]
     beam = prism(profile, length)[..., [1, 0, 2]]  # the profile lies across the street
     solids = [beam]
     if beams > 1:
         solids.append(beam + np.array([0, 0, BEAM_PITCH]))
 
-    post = box((0.1, 0.1, height + FOOT - 0.05), (0, 0.08, -FOOT))
+    post = box((0.1, 0.1, height + BELOW_GROUND - 0.05), (0, 0.08, -BELOW_GROUND))
     solids.append(copies(post, x=[-length / 4, length / 4]))
     return part(solids, Surface.METAL, Label.FENCE)
 
@@ -288,14 +299,16 @@ def _crash_barrier(fence: Fence, rng: np.random.Generator, length: float) -> Mes
 
 def _parapet(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     """Return the low concrete wall along a fast road or a bridge."""
-    body = box((length, 0.5, fence.height + FOOT), (0, 0, -FOOT), top=(1.0, 0.45))
+    body = box((length, 0.5, fence.height + BELOW_GROUND), (0, 0, -BELOW_GROUND), top=(1.0, 0.45))
     return fence.solid([body])
 
 
 def _noise_barrier(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     """Return panels with horizontal ribs between steel posts; the upper part may be of glass."""
-    base = box((length, 0.18, 0.5 + FOOT), (0, 0, -FOOT))
-    posts = copies(box((0.2, 0.24, fence.height + FOOT), (0, 0, -FOOT)), x=[-length / 2])
+    base = box((length, 0.18, 0.5 + BELOW_GROUND), (0, 0, -BELOW_GROUND))
+    posts = copies(
+        box((0.2, 0.24, fence.height + BELOW_GROUND), (0, 0, -BELOW_GROUND)), x=[-length / 2]
+    )
 
     glass_from = fence.height * 0.5 if fence.kind == "glass barrier" else fence.height
     bottom = np.arange(0.5, glass_from - 0.1, 0.25)
@@ -314,7 +327,7 @@ def _noise_barrier(fence: Fence, rng: np.random.Generator, length: float) -> Mes
 def gate(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """Return a closed gate: bars, a mesh or a smooth leaf in a frame, between two pillars."""
     frame = _beams(length, np.array([0.12, height - 0.03]), 0.06)
-    pillar = box((0.35, 0.35, height + FOOT + 0.1), (0, 0, -FOOT))
+    pillar = box((0.35, 0.35, height + BELOW_GROUND + 0.1), (0, 0, -BELOW_GROUND))
     pillars = copies(pillar, x=[-length / 2 - 0.18, length / 2 + 0.18])
     parts = [part([pillars], Surface.BRICK, Label.FENCE)]
 
@@ -328,18 +341,24 @@ def gate(rng: np.random.Generator, length: float, height: float) -> Mesh:
 
 @dataclass(frozen=True)
 class FenceKind:
-    """How a kind of fence is made, its lowest and highest height, and what it is made of."""
+    """How to make a kind of fence.
+
+    Attributes:
+        make: returns one segment of a fence, `length` metres along x.
+        height: smallest and largest height, metres.
+        surfaces: surfaces that the fence may have.
+    """
 
     make: Callable[[Fence, np.random.Generator, float], Mesh]
     height: tuple[float, float] = (0.6, 2.0)
     surfaces: tuple[Surface, ...] = (Surface.METAL,)
 
 
-WOODEN = (Surface.WOOD, Surface.PLASTIC)  # mostly wood
+WOODEN = (Surface.WOOD, Surface.PLASTIC)  # surfaces of boards; most boards are of wood
 _WALLS = (Surface.PLASTER, Surface.BRICK, Surface.STONE)
 _CONCRETE = (Surface.PLASTER,)
 _PANELS = (Surface.PLASTER, Surface.WOOD, Surface.METAL)
-KINDS = {
+FENCE_KINDS = {
     "boards": FenceKind(_boards, surfaces=WOODEN),
     "slats": FenceKind(_slats, surfaces=WOODEN),
     "pickets": FenceKind(_pickets, (0.5, 1.3), WOODEN),

@@ -1,6 +1,6 @@
-"""Meshes of poles, lamps, signs and what closes off a work zone.
+"""Make meshes of poles, lamps, signs and what closes off a work zone.
 
-Signs face -x: vehicles that drive towards +x see their fronts. Lamps reach towards +y.
+Signs face -x: a driver who goes towards +x sees their fronts. The arms of lamps reach towards +y.
 """
 
 from collections.abc import Sequence
@@ -11,20 +11,20 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place
 from lidarstreets.solids import box, copies, leaning, prism, tube
 
-FOOT = 0.4  # metres by which poles reach below the ground
+BELOW_GROUND = 0.4  # depth of poles below the ground, metres
 
 
 def _pole(
     rng: np.random.Generator, height: float, radius: float, top_radius: float | None = None
 ) -> np.ndarray:
-    """Return a straight, perhaps slightly slanted pole: (T, 3, 3)."""
-    mast = tube((0, 0, -FOOT), (0, 0, height), radius, top_radius, closed=False)
+    """Return the (T, 3, 3) triangles of a pole, which may slant a little."""
+    mast = tube((0, 0, -BELOW_GROUND), (0, 0, height), radius, top_radius, closed=False)
     slant_x, slant_y = rng.normal(scale=0.008 if rng.random() < 0.8 else 0.04, size=2)
     return leaning(mast, slant_x, slant_y)
 
 
 def lamp(rng: np.random.Generator) -> Mesh:
-    """Return a street lamp: with an arm over the road (towards +y), or a head on the mast."""
+    """Return a street lamp that has an arm over the road, towards +y, or a head on its mast."""
     height = rng.uniform(3, 10)
     radius = rng.uniform(0.03, 0.08)
     solids = [_pole(rng, height, radius, radius * rng.uniform(0.4, 1.0))]
@@ -90,7 +90,9 @@ def utility_pole(rng: np.random.Generator) -> Mesh:
 
     solids = [_pole(rng, height, radius, radius * 0.7)]
     if rng.random() < 0.12:
-        stay = tube((rng.uniform(1, 2), 0, -FOOT), (0, 0, height * 0.8), radius, closed=False)
+        stay = tube(
+            (rng.uniform(1, 2), 0, -BELOW_GROUND), (0, 0, height * 0.8), radius, closed=False
+        )
         solids.append(stay)
     if rng.random() < 0.5:
         solids.append(box((0.12, rng.uniform(0.8, 2.2), 0.12), (0, 0, height - 0.8)))
@@ -108,12 +110,13 @@ def flag_pole(rng: np.random.Generator) -> Mesh:
     )
 
 
-# Sides and radii of the faces of signs: discs (twice as many), triangles, octagons, diamonds.
+# Number of sides and radius in metres of the faces of signs: discs (which are twice as likely),
+# triangles, octagons, diamonds.
 _OUTLINES = ((12, 0.33), (12, 0.33), (3, 0.46), (8, 0.42), (4, 0.42))
 
 
 def _face(rng: np.random.Generator, height: float, x: float = -0.06) -> Mesh:
-    """Return the face of a sign whose lower edge is at a height: bright in front, dull behind."""
+    """Return the face of a sign, bright in front and dull behind; its lower edge is at `height`."""
     kind = rng.random()
     scale = rng.uniform(0.7, 1.3)
     if kind < 0.6:
@@ -171,10 +174,10 @@ def direction_board(rng: np.random.Generator) -> Mesh:
 
 
 def _board(rng: np.random.Generator, width: float, rise: float, height: float, posts: int) -> Mesh:
-    """Return a board whose lower edge is at a height, on a number of posts."""
+    """Return a board on posts; it is `rise` metres high, and its lower edge is at `height`."""
     post_y = np.linspace(-0.4, 0.4, posts) * width
     radius = rng.uniform(0.03, 0.08)
-    post_solid = tube((0, 0, -FOOT), (0, 0, height + rise), radius, closed=False)
+    post_solid = tube((0, 0, -BELOW_GROUND), (0, 0, height + rise), radius, closed=False)
     masts = part([copies(post_solid, y=post_y)], Surface.MAST, Label.POLE)
     front = box((0.03, width, rise), (-0.12, 0, height))
     return join(masts, _two_sided(rng, front, front + np.array([0.031, 0, 0])))
@@ -190,7 +193,7 @@ def _chevron(rng: np.random.Generator) -> Mesh:
 
 
 def traffic_light(rng: np.random.Generator) -> Mesh:
-    """Return a traffic light, whose housing SemanticKITTI counts as traffic sign."""
+    """Return a traffic light; SemanticKITTI counts its housing as traffic sign."""
     mast = _pole(rng, 3.4, rng.uniform(0.05, 0.1))
     lamps = [box((0.25, 0.3, 0.9), (0, 0.1, 2.4))]
     backboard = [box((0.02, 0.5, 1.1), (0.1, 0.1, 2.3))]
@@ -210,10 +213,11 @@ def traffic_light(rng: np.random.Generator) -> Mesh:
 
 
 def gantry(rng: np.random.Generator, width: float) -> Mesh:
-    """Return a portal with direction signs over a road that is `width` metres wide, along y."""
+    """Return a portal with direction signs, which spans `width` metres along y."""
     height = rng.uniform(5.2, 6.2)
     masts = copies(
-        tube((0, 0, -FOOT), (0, 0, height + 1), 0.18, closed=False), y=[-width / 2, width / 2]
+        tube((0, 0, -BELOW_GROUND), (0, 0, height + 1), 0.18, closed=False),
+        y=[-width / 2, width / 2],
     )
     beams = copies(box((0.3, width, 0.3)), z=[height, height + 1.2])
     board = box((0.05, width * 0.3, 2.0), (-0.25, -width * 0.2, height))
@@ -227,14 +231,14 @@ def gantry(rng: np.random.Generator, width: float) -> Mesh:
 
 def railway_mast(rng: np.random.Generator) -> Mesh:
     """Return the mast of an overhead line, with an arm towards +y."""
-    mast = box((0.3, 0.3, 7.5 + FOOT), (0, 0, -FOOT), top=(0.6, 0.6))
+    mast = box((0.3, 0.3, 7.5 + BELOW_GROUND), (0, 0, -BELOW_GROUND), top=(0.6, 0.6))
     arm = tube((0, 0, 6.5), (0, 3, 6.0), 0.05, sides=5)
     surface = Surface.METAL if rng.random() < 0.6 else Surface.PLASTER
     return part([mast, arm], surface, Label.POLE)
 
 
 def barrier(length: float) -> Mesh:
-    """Return a segment of the concrete barrier that closes off a work zone."""
+    """Return a segment of a concrete barrier, `length` metres along x."""
     profile: Sequence[tuple[float, float]] = [
         (-0.3, 0), (0.3, 0), (0.3, 0.08), (0.12, 0.35), (0.08, 0.8), (-0.08, 0.8), (-0.12, 0.35),
         (-0.3, 0.08),

@@ -1,4 +1,4 @@
-"""Meshes of plants without a stem: hedges, bushes, undergrowth, reeds, crops and creepers.
+"""Make meshes of plants without a stem: hedges, bushes, undergrowth, reeds, crops and creepers.
 
 Banks and rows of plants lie along x.
 """
@@ -13,8 +13,9 @@ from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, hull, leaning, loft, tube
 from lidarstreets.tables import read_table
 
+# Cross sections of banks of leaves by name.
 SECTIONS = read_table(Path(__file__).with_suffix(".toml"))["sections"]
-FOOT = 0.3  # metres by which plants reach below the ground, so that a slope leaves no gap
+BELOW_GROUND = 0.3  # depth of plants below the ground, so that a slope leaves no gap, metres
 
 
 def foliage(
@@ -23,7 +24,14 @@ def foliage(
     tint: float = 0.0,
     surface: Surface = Surface.LEAF,
 ) -> Mesh:
-    """Return clumps of leaves that pulses enter by `depth` metres on average."""
+    """Return clumps of leaves as one mesh with the class vegetation.
+
+    Args:
+        hulls: (T, 3, 3) triangles of the closed hull of each clump, metres.
+        depth: mean distance that a pulse travels inside, metres; see `Mesh`.
+        tint: brightness, as in `Mesh`.
+        surface: surface of leaves or twigs.
+    """
     return part(hulls, surface, Label.VEGETATION, depth, tint=tint)
 
 
@@ -37,8 +45,13 @@ def bank(
 ) -> np.ndarray:
     """Return the (T, 3, 3) triangles of a closed bank of leaves along x.
 
-    Its `section` is one of `SECTIONS`, `size` its width and height, `uneven` the standard deviation
-    of the corners, and `step` the distance between two rings of corners, all in metres.
+    Args:
+        rng: draws how uneven it is.
+        length: length along x, metres.
+        section: its cross section, a key of `SECTIONS`.
+        size: width and height of the section, metres.
+        uneven: standard deviation of the position of a corner, metres.
+        step: distance between two rings of corners along x, metres.
     """
     width, height = size
     corners = np.array(SECTIONS[section]) * (width, height)
@@ -50,23 +63,24 @@ def bank(
 
     swell = 1 + rng.normal(scale=uneven / height, size=count)
     rings[..., 2] *= np.clip(swell, 0.4, 1.7)[:, None]
-    # A limit, so that the two sides never cross.
+    # This limit keeps the two sides from crossing.
     limit = 0.2 * min(width, height)
     rings += np.clip(rng.normal(scale=uneven, size=rings.shape), -limit, limit)
-    rings[:, (0, -1), 2] = -FOOT
+    rings[:, (0, -1), 2] = -BELOW_GROUND
     return loft(rings)
 
 
 @dataclass(frozen=True)
 class Hedge:
-    """A kind of hedge, the same along a boundary; lengths are in metres.
+    """A kind of hedge, the same along a whole boundary. Lengths are in metres.
 
     Attributes:
-        section: one of `SECTIONS`.
-        width, height: of the section.
-        depth: as in `Mesh`.
+        section: its cross section, a key of `SECTIONS`.
+        width: width of the section.
+        height: height of the section.
+        depth: depth of the leaves, as in `Mesh`.
         uneven: how far the surface is off the section.
-        tint: as in `Mesh`.
+        tint: tint, as in `Mesh`.
     """
 
     section: str
@@ -84,7 +98,7 @@ class Hedge:
 
 
 def draw_hedge(rng: np.random.Generator, height: float) -> Hedge:
-    """Draw a kind of hedge: neatly clipped, or grown wild."""
+    """Draw a kind of hedge, `height` metres high: clipped, or grown wild."""
     is_clipped = rng.random() < 0.7
     sections = ("box", "wedge", "dome", "cone") if is_clipped else ("dome", "bulge", "cone")
     return Hedge(
@@ -98,7 +112,7 @@ def draw_hedge(rng: np.random.Generator, height: float) -> Hedge:
 
 
 def bush(rng: np.random.Generator, radius: float) -> Mesh:
-    """Return a bush, from knee-high to taller than a person: dense, or thin down to bare twigs."""
+    """Return a bush; some are dense, others are thin or have bare twigs."""
     height = radius * rng.uniform(0.7, 1.6)
     kind = rng.random()
 
@@ -114,7 +128,7 @@ def bush(rng: np.random.Generator, radius: float) -> Mesh:
 
 
 def slender_bush(rng: np.random.Generator) -> Mesh:
-    """Return a rose, a young thuja or a perennial: as tall as a person or lower, and narrower."""
+    """Return a rose, a young thuja or a perennial, 0.5 to 1.9 m high and narrow."""
     radius = rng.uniform(0.1, 0.35)
     height = rng.uniform(0.5, 1.9)
     middle = height * rng.uniform(0.45, 0.7)
@@ -125,7 +139,9 @@ def slender_bush(rng: np.random.Generator) -> Mesh:
     taper = rng.uniform(0.3, 1.0)
     leaves = hull(rng, (0, 0, middle), radii, taper=taper, fine=False)
     depth = rng.uniform(0.017, 0.51)
-    stem = tube((0, 0, -FOOT), (0, 0, middle), rng.uniform(0.01, 0.03), sides=4, closed=False)
+    stem = tube(
+        (0, 0, -BELOW_GROUND), (0, 0, middle), rng.uniform(0.01, 0.03), sides=4, closed=False
+    )
 
     return join(
         part([stem], Surface.BARK, Label.VEGETATION),
@@ -151,7 +167,7 @@ def _sticks(rng: np.random.Generator, radius: float, height: float) -> Mesh:
 
 
 def tall_grass(rng: np.random.Generator, length: float) -> Mesh:
-    """Return a strip of weeds, tall grass or reeds, which is labelled vegetation."""
+    """Return a strip of weeds, tall grass or reeds with the class vegetation."""
     is_reed = rng.random() < 0.2
     height = rng.uniform(1.2, 2.4) if is_reed else rng.uniform(0.2, 0.9)
     size = (rng.uniform(0.5, 2.2), height)
@@ -162,31 +178,38 @@ def tall_grass(rng: np.random.Generator, length: float) -> Mesh:
 def turf(
     rng: np.random.Generator, size: tuple[float, float], height: float, tint: float = 0.0
 ) -> Mesh:
-    """Return a patch of uncut grass or stubble on the ground, which is labelled terrain.
+    """Return a patch of uncut grass or stubble with the class terrain.
 
     Pulses that arrive at a low angle end in it at very different ranges.
+
+    Args:
+        rng: draws the depth.
+        size: size along x and y, metres.
+        height: height of the grass, metres.
+        tint: brightness, as in `Mesh`.
     """
-    blades = box((size[0], size[1], height + FOOT), (0, 0, -FOOT))
+    blades = box((size[0], size[1], height + BELOW_GROUND), (0, 0, -BELOW_GROUND))
     return part([blades], Surface.GRASS, Label.TERRAIN, rng.uniform(0.3, 1.6), tint=tint)
 
 
 def ground_cover(rng: np.random.Generator, width: float, height: float) -> Mesh:
-    """Return a patch of low plants, which is labelled vegetation."""
+    """Return a patch of low plants with the class vegetation, about `width` metres wide."""
     leaves = bank(rng, width + 0.4, "dome", (1.2 * width, height), 0.3 * height, step=0.8)
     return foliage([leaves], rng.uniform(0.034, 0.68), rng.normal(scale=0.5))
 
 
 @dataclass(frozen=True)
 class Thicket:
-    """A kind of undergrowth or wood edge; lengths are in metres.
+    """A kind of undergrowth or wood edge. Lengths are in metres.
 
     Attributes:
-        section: one of `SECTIONS`.
-        width: smallest and largest.
-        depth: as in `Mesh`; from nearly solid to so thin that most pulses pass.
+        section: its cross section, a key of `SECTIONS`.
+        width: smallest and largest width.
+        depth: depth of the leaves, as in `Mesh`. Some kinds are nearly solid; most pulses pass
+            others.
         uneven: how far the surface is off the section, as a share of the height.
-        stems: trunks per metre that are seen through the leaves.
-        tint: as in `Mesh`.
+        stems: mean number of trunks per metre that are visible through the leaves.
+        tint: tint, as in `Mesh`.
     """
 
     section: str
@@ -197,7 +220,7 @@ class Thicket:
     tint: float
 
     def segment(self, rng: np.random.Generator, length: float, height: float) -> Mesh:
-        """Return a piece, `length` metres along x."""
+        """Return a piece, `length` metres along x and `height` metres high."""
         size = (rng.uniform(*self.width), height)
         uneven = self.uneven * min(height, 4.0)
         leaves = [bank(rng, length + 0.6, self.section, size, uneven, step=1.0)]
@@ -212,7 +235,9 @@ class Thicket:
             y = rng.uniform(-0.5, 0.5) * size[0]
             lean_x, lean_y = rng.normal(scale=0.06 * height, size=2)
             tip = (x + lean_x, y + lean_y, height)
-            stems.append(tube((x, y, -FOOT), tip, rng.uniform(0.03, 0.12), 0.03, 5, closed=False))
+            stems.append(
+                tube((x, y, -BELOW_GROUND), tip, rng.uniform(0.03, 0.12), 0.03, 5, closed=False)
+            )
 
         trunks = part(stems, Surface.BARK, Label.TRUNK)
         return join(trunks, foliage(leaves, self.depth, self.tint + rng.normal(scale=0.3)))
@@ -233,7 +258,7 @@ def draw_thicket(rng: np.random.Generator) -> Thicket:
 
 
 def ivy(rng: np.random.Generator, length: float, height: float) -> Mesh:
-    """Return creepers that cover a wall at y = 0 from the side of -y."""
+    """Return creepers that cover a wall at y = 0 on its side -y."""
     leaves = bank(rng, length, "bulge", (0.35, height), 0.04, step=0.8)
     return foliage([leaves], rng.uniform(0.051, 0.2), rng.normal(scale=0.5))
 

@@ -1,4 +1,4 @@
-"""Meshes of trees: stems, boughs and crowns."""
+"""Make meshes of trees: stems, boughs and crowns."""
 
 import numpy as np
 
@@ -9,9 +9,10 @@ from lidarstreets.solids import Vector, hull, tube
 
 
 def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
-    """Return a broad-leaved tree; `fine=False` is for distant rows.
+    """Return a broad-leaved tree, `height` metres high.
 
-    It has one stem or several, and a crown of leafy clumps, one airy crown, or bare boughs.
+    It has one or more stems, and either a crown of several clumps, one airy crown or bare boughs.
+    `fine=False` gives it one stem and fewer triangles, for rows of distant trees.
     """
     fork_height = height * rng.uniform(0.12, 0.4)
     spread = height * rng.uniform(0.18, 0.38)
@@ -25,7 +26,7 @@ def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
         parts.append(part(stem, Surface.BARK, Label.TRUNK))
     if rng.random() < 0.1:
         parts.append(_ivy(rng, fork, radius))
-    if rng.random() < 0.4:  # grass and shoots at its foot
+    if rng.random() < 0.4:  # grass and shoots grow at its foot
         wide = radius + rng.uniform(0.1, 0.5)
         tuft = hull(rng, (0, 0, 0), (wide, wide, rng.uniform(0.1, 0.45)), fine=False)
         parts.append(foliage([tuft], rng.uniform(0.05, 0.6)))
@@ -45,7 +46,7 @@ def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
 def _stem(
     rng: np.random.Generator, height: float, radius: float, slant: float
 ) -> tuple[list[np.ndarray], Vector]:
-    """Return the solids of a crooked stem, and the point where it ends."""
+    """Return the solids of a crooked stem, and the point (x, y, z) where it ends."""
     lean = rng.normal(scale=slant, size=2)
     crook = radius * rng.uniform(0.1, 0.9)
 
@@ -57,7 +58,7 @@ def _stem(
         z = height * (index + 1) / pieces
         x, y = lean * z + rng.normal(scale=crook, size=2)
         end = (float(x), float(y), z)
-        # Thick at the root, then nearly even.
+        # The stem is thick at the root, then nearly even.
         first = radius * (1.35 if index == 0 else 1.0)
         solids.append(tube(start, end, first, radius * 0.97, sides=7, closed=False))
         start = end
@@ -91,7 +92,7 @@ def _clumps(
 def _cloud(
     rng: np.random.Generator, fork: Vector, height: float, spread: float, radius: float
 ) -> Mesh:
-    """Return one large airy crown, in which pulses end metres apart, perhaps down to the ground."""
+    """Return one large airy crown, which may reach down near the ground; pulses go far into it."""
     boughs = []
 
     for _ in range(int(rng.integers(3, 6))):
@@ -180,7 +181,7 @@ def sapling(rng: np.random.Generator) -> Mesh:
 
 
 def random_tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
-    """Return a broad-leaved tree, a fir, a column or a young tree; `fine=False` is for far ones."""
+    """Return a broad-leaved tree, a fir, a column or a young tree; see `tree` for `fine`."""
     kind = rng.random()
     if kind < 0.14:
         return conifer(rng, height)
@@ -192,7 +193,7 @@ def random_tree(rng: np.random.Generator, height: float, fine: bool = True) -> M
 
 
 def copse(rng: np.random.Generator, length: float, height: float) -> Mesh:
-    """Return the edge of a distant wood."""
+    """Return the edge of a distant wood, `length` metres along x."""
     size = (rng.uniform(4, 9), height * rng.uniform(0.8, 1.2))
     edge = bank(rng, length + 2, "bulge", size, height * rng.uniform(0.03, 0.12), step=2.5)
     return foliage([edge], rng.uniform(0.1, 1.5), rng.normal(scale=0.4))

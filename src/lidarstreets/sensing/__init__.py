@@ -1,1 +1,1 @@
-"""The simulated LiDARs: what their pulses hit, and what they measure."""
+"""Simulate LiDARs: what their pulses hit, and what they measure."""

@@ -1,4 +1,4 @@
-"""Casts the rays of a rotating LiDAR and finds what they hit."""
+"""Cast the rays of a rotating LiDAR and find what they hit."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from lidarstreets.materials import GROUND_SURFACES, Label, Surface
 from lidarstreets.mesh import Mesh, part
 from lidarstreets.sensing.sensors import LidarModel
 
-SHADOW_EDGE = 6.0  # degrees by which the edges of the car's shadow differ between lasers
-MOST_CROSSINGS = 16  # surfaces of clumps of leaves that a pulse may cross on its way in and out
-BEYOND = 0.002  # metres behind a surface at which a ray continues
-CLUMP = (0.2, 0.7)  # metres across a clump of leaves, and correlation of how far pulses enter it
-GAP = (0.6, 0.9)  # the same of gaps between clumps
-OPENNESS = (1.5, 1.7)  # of gaps: median factor on the depth, and spread of its logarithm
-LEAF_COSINE = 0.5  # mean cosine of the angle of incidence: leaves and blades point anywhere
+SHADOW_EDGE = 6.0  # largest difference of the edges of the car's shadow between lasers, degrees
+MAX_CROSSINGS = 16  # largest number of surfaces of foliage that a pulse crosses on its way
+RESTART_DISTANCE = 0.002  # distance behind a surface at which its ray continues, metres
+# Arguments of `patchy_normal`, patch in metres and correlation: for how far pulses enter a clump of
+# leaves, and for the gaps between clumps.
+CLUMP_PATCH = (0.2, 0.7)
+GAP_PATCH = (0.6, 0.9)
+# Median of the factor on the depth of foliage in a gap, and standard deviation of its logarithm.
+GAP_OPENNESS = (1.5, 1.7)
+LEAF_COSINE = 0.5  # mean cosine of the angle of incidence on leaves, which point anywhere
 
 
 def require_embree() -> tuple[ModuleType, ModuleType]:
-    """Return the two modules of embreex that cast rays.
+    """Return the modules `rtcore_scene` and `mesh_construction` of embreex, which cast rays.
 
     Raises:
         SimulationError: if the extra `simulate` is not installed.
@@ -45,10 +48,10 @@ def require_embree() -> tuple[ModuleType, ModuleType]:
 
 
 def take_one_thread() -> None:
-    """Let this process cast rays with one thread, if it has not cast any yet.
+    """Let this process cast rays with one thread. Call this before it casts its first ray.
 
-    Embree counts the processors that it may use when it is first used; there is no other way to
-    tell it. Does nothing on systems other than Linux.
+    When Embree is first used, it counts the processors that it may use, and takes as many threads.
+    There is no other way to set their number. Do nothing on systems other than Linux.
     """
     if hasattr(os, "sched_setaffinity"):
         processors = os.sched_getaffinity(0)
@@ -59,7 +62,11 @@ def take_one_thread() -> None:
 
 
 class RayScene:
-    """A mesh that rays can be cast at."""
+    """A mesh that rays can be cast at.
+
+    Raises:
+        SimulationError: if embreex is missing.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         scenes, meshes = require_embree()
@@ -73,9 +80,15 @@ class RayScene:
         self.normals = (normals / length).astype(np.float32)
 
     def cast(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distance and triangle of the first hit of each ray: (R,) and (R,).
+        """Return how far each of R rays travels, and the triangle that it hits.
 
-        They are infinite and -1 if a ray hits nothing.
+        Args:
+            origin: (R, 3) float32 starts of the rays, metres.
+            direction: (R, 3) float32 unit vectors.
+
+        Returns:
+            (R,) distances in metres, infinite if a ray hits nothing; and (R,) int64 indices of the
+            triangles, -1 if a ray hits nothing.
         """
         hits = self._scene.run(origin, direction, output=1)
         triangle = hits["primID"].astype(np.int64)
@@ -83,22 +96,26 @@ class RayScene:
 
 
 class GroundAppearance(Protocol):
-    """Class and tint of the ground, whose triangles have no class; all arrays are (N,)."""
+    """The class and the tint of the ground, whose triangles have neither; all arrays are (N,)."""
 
     def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the class ids at places."""
+        """Return the class ids at the places x, y, metres."""
 
     def tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
-        """Return the tint at places, as in `Mesh`."""
+        """Return the tints at the places x, y, metres, as in `Mesh`."""
 
 
 @dataclass(frozen=True)
 class Rays:
-    """The shots of one rotation that the car does not block, in the sensor's frame.
+    """The R shots of one rotation that the car does not block, in the sensor's frame.
 
-    They are (R,) rows, sorted by laser from the top down, then by azimuth from +x: unit vectors,
-    heights of their origins in metres, indices of the lasers (0 = lowest), and seconds from the
-    moment when the sensor looks ahead.
+    They are sorted by laser from the top down, then by azimuth from +x.
+
+    Attributes:
+        direction: (R, 3) float32 unit vectors.
+        height: (R,) float32 heights of their origins, metres.
+        ring: (R,) uint8 indices of the lasers; 0 is the lowest laser.
+        time: (R,) float32 seconds after the moment when the sensor looks ahead.
     """
 
     direction: np.ndarray
@@ -109,19 +126,20 @@ class Rays:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the rays of one rotation hit, in the sensor's frame.
+    """What the rays of one rotation hit, in the sensor's frame: N hits.
 
     Attributes:
-        direction: (N, 3) unit vectors.
-        height: (N,) metres from the origin of the coordinates up to that of the ray.
-        distance: (N,) metres along the ray.
-        facing: (N,) cosine of the angle between ray and surface normal.
-        cosine: (N,) the same, or its mean over the leaves and blades of plants.
-        surface: (N,) rows of the reflection table.
-        tint: (N,) as in `Mesh`.
-        label, instance: (N,) class and instance ids.
-        ring: (N,) index of the laser, 0 = lowest.
-        shift: (N, 3) metres that the sensor had moved when it fired.
+        direction: (N, 3) unit vectors of the rays.
+        height: (N,) heights of the origins of the rays over the origin of the frame, metres.
+        distance: (N,) distances along the rays, metres.
+        facing: (N,) cosines of the angles between rays and surface normals, 0 to 1.
+        cosine: (N,) the same cosines; for leaves and blades of grass their mean `LEAF_COSINE`.
+        surface: (N,) values of `Surface`.
+        tint: (N,) tints, as in `Mesh`.
+        label: (N,) class ids.
+        instance: (N,) instance ids; 0 is no instance.
+        ring: (N,) indices of the lasers; 0 is the lowest laser.
+        shift: (N, 3) how far the sensor had moved when it fired, metres.
     """
 
     direction: np.ndarray
@@ -138,7 +156,7 @@ class Hits:
 
     @property
     def places(self) -> np.ndarray:
-        """(N, 3) metres from the origin of the ray to the surface."""
+        """The vectors from the origins of the rays to the surfaces: (N, 3), metres."""
         return self.direction * self.distance[:, None]
 
 
@@ -148,7 +166,7 @@ def rays_of(sensor: LidarModel) -> Rays:
     lasers = len(sensor.elevations)
     elevation = np.radians(np.array(sensor.elevations))[:, None]
 
-    # The lasers of a real device are not in one line: each has an azimuth offset of its own.
+    # The lasers of a real device do not form one line: each has its own offset in azimuth.
     offset = ((np.arange(lasers) * 0.618) % 1.0)[:, None]
     fraction = (np.arange(sensor.azimuth_steps) + offset) / sensor.azimuth_steps  # of a rotation
     azimuth = 2 * np.pi * fraction
@@ -182,7 +200,7 @@ def _is_hidden(sensor: LidarModel) -> np.ndarray:
     elevation = np.array(sensor.elevations)[:, None]
     azimuth = np.arange(sensor.azimuth_steps) * 360 / sensor.azimuth_steps
 
-    # The edges differ between lasers, which look out of the device at different places.
+    # The edges of the shadow differ, because the lasers look out of the device at different places.
     offset = (np.arange(len(elevation)) * 0.382) % 1.0 - 0.5
     azimuth = azimuth + SHADOW_EDGE * offset[:, None]
 
@@ -196,8 +214,9 @@ def _is_hidden(sensor: LidarModel) -> np.ndarray:
 class _NearestHits:
     """The nearest hit of each of R rays over all scenes; all columns are (R,).
 
-    The columns of `Mesh` describe the triangle that is hit. The distance is infinite if a ray hits
-    none; `facing`, the product of ray and normal, is negative if the ray comes from outside.
+    The columns of `Mesh` describe the triangle that a ray hits. The distance is infinite if the ray
+    hits nothing. `facing`, the dot product of ray and normal, is negative if the ray comes from
+    outside.
     """
 
     def __init__(
@@ -224,7 +243,10 @@ class _NearestHits:
     def replace(
         self, index: np.ndarray, hits: _NearestHits, rows: np.ndarray, start: np.ndarray
     ) -> None:
-        """Replace the hits of some rays by rows of others, whose rays began at `start` metres."""
+        """Replace the hits of the rays `index` by the rows `rows` of other hits.
+
+        Those rays began at `start` metres along the rays of this object.
+        """
         self.distance[index] = start + hits.distance[rows]
         for name in ("facing", *_MESH_COLUMNS):
             getattr(self, name)[index] = getattr(hits, name)[rows]
@@ -243,8 +265,17 @@ def trace(
 ) -> Hits:
     """Return what each shot of one rotation hits first, or where it ends in foliage.
 
-    The pose is the (4, 4) transform from the sensor's frame to the frame of the street, when the
-    sensor looks ahead; the speed is along its x axis in metres per second.
+    Args:
+        scenes: the meshes, in the frame of the street.
+        sensor: the device.
+        pose: (4, 4) transform from the sensor's frame to the frame of the street at the moment when
+            the sensor looks ahead.
+        ground: gives the class and the tint of triangles without a class.
+        rng: draws where rays end in foliage.
+        speed: speed of the sensor along its x axis, metres per second.
+
+    Raises:
+        SimulationError: if embreex is missing.
     """
     rays = rays_of(sensor)
     rotation = pose[:3, :3].astype(np.float32)
@@ -299,32 +330,32 @@ def _enter_foliage(
 ) -> None:
     """Extend rays that hit foliage to the leaf that stops them, or to the surface behind it.
 
-    The distance inside is exponentially distributed. Its mean is the depth of the foliage times a
-    factor that differs from gap to gap.
+    The distance that a ray travels inside is exponentially distributed. Its mean is the depth of
+    the foliage times a factor that differs from gap to gap.
     """
-    index = np.flatnonzero(nearest.depth > 0)  # of the rays that are still on their way
-    clumps = np.zeros(len(index), dtype=np.int32)  # that each ray is inside of: clumps overlap
+    index = np.flatnonzero(nearest.depth > 0)  # indices of the rays that are still on their way
+    clumps = np.zeros(len(index), dtype=np.int32)  # number of clumps around the end of each ray
 
-    for _ in range(MOST_CROSSINGS):
+    for _ in range(MAX_CROSSINGS):
         if not len(index):
             return
 
-        # Each ray has reached the surface of a clump: look for the next surface behind it.
+        # Each ray has reached the surface of a clump: find the next surface behind it.
         clumps += np.where(nearest.facing[index] < 0, 1, -1)
-        start = nearest.distance[index] + BEYOND
+        start = nearest.distance[index] + RESTART_DISTANCE
         next_origin = origin[index] + direction[index] * start[:, None]
         behind = _NearestHits(scenes, next_origin, direction[index])
 
-        # Between the two surfaces, a leaf may stop it.
-        leafless = patchy_normal(rng, next_origin, *CLUMP)
-        gap = patchy_normal(rng, next_origin, *GAP)
-        depth = OPENNESS[0] * np.exp(OPENNESS[1] * gap) * nearest.depth[index]
+        # Between the two surfaces, a leaf may stop the ray.
+        leafless = patchy_normal(rng, next_origin, *CLUMP_PATCH)
+        gap = patchy_normal(rng, next_origin, *GAP_PATCH)
+        depth = GAP_OPENNESS[0] * np.exp(GAP_OPENNESS[1] * gap) * nearest.depth[index]
         free_path = -log_ndtr(leafless) * depth
         free_path[clumps <= 0] = np.inf
         stops = free_path < behind.distance
         nearest.distance[index[stops]] += free_path[stops]
 
-        # The other rays reach the next surface; they continue if it is foliage.
+        # The other rays reach the next surface, and continue if it is foliage.
         rows = np.flatnonzero(~stops)
         index = index[rows]
         clumps = clumps[rows]

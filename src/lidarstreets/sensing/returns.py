@@ -1,4 +1,4 @@
-"""Which pulses of a LiDAR return, at which range, and how bright."""
+"""Decide which pulses of a LiDAR return, at which range, and how bright."""
 
 from dataclasses import dataclass
 
@@ -10,43 +10,46 @@ from lidarstreets.materials import REFLECTIONS, Label
 from lidarstreets.sensing.lidar import Hits
 from lidarstreets.sensing.sensors import LidarModel
 
-# How the brightness falls with the range, as a power of it; see `LidarModel.half_range`.
-FADING = 3.0
-# Metres within which a surface is near to a laser that is focused far away.
-NEAR = 9.0
-# Brightness from where returns are recorded as 0 to where they are not: the scale of a logistic.
+# Power of the range with which the brightness falls; see `LidarModel.half_range`.
+FADING_POWER = 3.0
+# Range within which lasers that are focused far away lose brightness, metres.
+NEAR_RANGE = 9.0
+# Scale of the logistic curve between brightnesses that are reported as 0 and larger ones.
 BRIGHTNESS_STEP = 0.02
-# Metres: smallest and largest step in depth within which one pulse gives one return in between.
-SMALLEST_MIXED_STEP = 0.3
-LARGEST_MIXED_STEP = 20.0
-# Neighbouring returns are alike: metres within which they are, and their correlation, for loss and
-# glare, for the height of relief such as tufts of grass, and for the mean height of relief.
-PATCH = (0.5, 0.97)
-TUFT = (0.3, 0.85)
-MEADOW = (8.0, 0.8)
-# Spread of the mean height of relief: standard deviation of its logarithm.
+# Smallest and largest step in depth across which one pulse can return from in between, metres.
+MIN_MIXED_STEP = 0.3
+MAX_MIXED_STEP = 20.0
+# Arguments of `patchy_normal`, patch in metres and correlation: for loss and glare, for the height
+# of relief such as tufts of grass, and for the mean height of relief.
+LOSS_PATCH = (0.5, 0.97)
+RELIEF_PATCH = (0.3, 0.85)
+MEAN_RELIEF_PATCH = (8.0, 0.8)
+# Standard deviation of the logarithm of the mean height of relief.
 RELIEF_SPREAD = 0.8
-LEAST_COSINE = 0.06  # of the angle between ray and normal: relief is no deeper along the ray
-LEAST_NOISE = 0.4  # of the mean brightness of a surface
-LOW_LASERS_LEAST = 0.35  # of the least brightness: the lower half of the lasers sees darker things
-# Metres: smallest and mean distance by which a ghost, a mirrored body, lies behind the mirror.
-GHOST_NEAREST = 0.5
-GHOST_MEAN = 6.0
-OWN_LASERS = 8  # the lowest lasers, which see racks and other parts of the car itself
-OWN_REACH = 2.0  # metres to the farthest of these parts
-DARK_SHARE = 0.35  # of the reflectivity, at most, that a dark return has
-NEIGHBOUR_ANGLE = 0.5  # degrees between neighbouring shots of one laser, at most
+# Smallest cosine of the angle between ray and normal; it limits the depth of relief along the ray.
+MIN_COSINE = 0.06
+# Smallest factor that noise puts on the brightness of a surface.
+MIN_NOISE_FACTOR = 0.4
+# Factor on the least brightness for the lower half of the lasers, which see darker surfaces.
+LOW_LASERS_FACTOR = 0.35
+# Smallest and mean distance of a ghost, a mirrored body, behind the mirror, metres.
+GHOST_MIN_DISTANCE = 0.5
+GHOST_MEAN_DISTANCE = 6.0
+OWN_CAR_LASERS = 8  # number of the lowest lasers, which see racks and other parts of the car
+OWN_CAR_REACH = 2.0  # range of the farthest part of the car, metres
+DARK_FACTOR = 0.35  # largest factor on the reflectivity of a dark return
+MAX_NEIGHBOUR_ANGLE = 0.5  # largest angle between neighbouring shots of one laser, degrees
 
 
 @dataclass(frozen=True)
 class Lasers:
-    """How the lasers of one device differ; rows go from the lowest laser up.
+    """How the L lasers of one device differ. The first row is the lowest laser.
 
     Attributes:
-        gain: (L,) factors on the intensity; a few are far from 1.
+        gain: (L,) factors on the intensity, 0.3 to 1.3; a few are far from 1.
         near_loss: (L,) shares of the brightness of near surfaces that are lost.
-        range_error: (L,) metres by which each laser measures too far.
-        least_brightness: (L,) as in `LidarModel`, which has that of the upper half.
+        range_error: (L,) float32 distances by which each laser measures too far, metres.
+        least_brightness: (L,) least brightness, as in `LidarModel`, of each laser.
     """
 
     gain: np.ndarray
@@ -56,16 +59,16 @@ class Lasers:
 
 
 def draw_lasers(sensor: LidarModel, rng: np.random.Generator) -> Lasers:
-    """Draw the lasers of one device."""
+    """Draw how the lasers of one device differ."""
     count = len(sensor.elevations)
     gain = 1 + sensor.gain_spread * rng.standard_t(3, count)
 
-    # The mean of this beta distribution is a third.
+    # The mean of this beta distribution is 1 / 3.
     near_loss = 3 * sensor.near_loss * rng.beta(1, 2, count)
     near_loss[: count // 2] = 0
     range_error = (sensor.range_error * rng.standard_normal(count)).astype(np.float32)
     least_brightness = np.full(count, sensor.least_brightness)
-    least_brightness[: count // 2] *= LOW_LASERS_LEAST
+    least_brightness[: count // 2] *= LOW_LASERS_FACTOR
     return Lasers(np.clip(gain, 0.3, 1.3), near_loss, range_error, least_brightness)
 
 
@@ -75,19 +78,19 @@ def receive(
     """Return the points that the sensor measures, with noise, intensity and lost returns.
 
     Returns:
-        (N, 4) float32 x, y, z, intensity; (N,) uint32 class ids with the instance in the upper
-        half; (N,) uint8 rings.
+        (N, 4) float32 x, y, z in metres and intensity in [0, 0.99]; (N,) uint32 class ids with the
+        instance ids in the upper 16 bits; (N,) uint8 indices of the lasers.
     """
     base, _, shade, _, drop, relief, ghost = REFLECTIONS[hits.surface].T
     reflectivity = base * np.exp(shade * hits.tint)
 
-    # The received power falls with the square of the range; a return is lost if noise covers it.
+    # The received power falls with the square of the range. A return below the noise is lost.
     reach = sensor.reach * np.sqrt(reflectivity * np.maximum(hits.cosine, 1e-3))
     chance = 1 / (1 + (hits.distance / reach) ** 6) * (1 - drop) * (1 - sensor.drop)
 
     distance = _measured_distance(hits, sensor, relief, rng) + lasers.range_error[hits.ring]
     is_ghost = rng.random(len(ghost), np.float32) < ghost
-    beyond = GHOST_NEAREST + GHOST_MEAN * rng.standard_exponential(is_ghost.sum())
+    beyond = GHOST_MIN_DISTANCE + GHOST_MEAN_DISTANCE * rng.standard_exponential(is_ghost.sum())
     distance[is_ghost] += beyond.astype(np.float32)
     chance[(distance < sensor.min_range) | (distance > sensor.max_range)] = 0
 
@@ -95,7 +98,7 @@ def receive(
 
     # Parts of the car itself are too near and too glossy to be bright.
     is_own = _hits_own_car(hits, sensor, rng)
-    distance[is_own] = rng.uniform(sensor.min_range, OWN_REACH, is_own.sum())
+    distance[is_own] = rng.uniform(sensor.min_range, OWN_CAR_REACH, is_own.sum())
     intensity[is_own] = 0
     chance[is_own] = 1
 
@@ -134,22 +137,22 @@ def _intensity(
     """Return the (N,) intensities in [0, 0.99] that the device reports."""
     _, spread, _, dark, *_ = REFLECTIONS[hits.surface].T
 
-    # The device compensates for range and incidence until the power is too small.
+    # The device compensates for range and angle of incidence until the power is too small.
     power = hits.cosine * (10 / np.maximum(hits.distance, 1)) ** 2
-    is_near = np.exp(-((hits.distance / NEAR) ** 4))
-    # Few returns are far from the mean, but more than with a normal distribution.
+    is_near = np.exp(-((hits.distance / NEAR_RANGE) ** 4))
+    # Few returns are far from the mean, but more of them than in a normal distribution.
     deviation = sensor.intensity_noise * spread * rng.standard_t(3, len(spread))
-    noise = np.maximum(1 + deviation, LEAST_NOISE) ** (1 / sensor.gamma)
+    noise = np.maximum(1 + deviation, MIN_NOISE_FACTOR) ** (1 / sensor.gamma)
 
     brightness = reflectivity * noise * power**2 / (power**2 + sensor.half_power**2)
-    brightness /= 1 + (hits.distance / sensor.half_range) ** FADING
+    brightness /= 1 + (hits.distance / sensor.half_range) ** FADING_POWER
     brightness *= np.interp(hits.distance, *np.transpose(sensor.response))
     brightness *= 1 - lasers.near_loss[hits.ring] * is_near
 
     darkness = _patchy(hits, rng) / np.maximum(dark, 1e-6)
-    brightness *= np.where(darkness < 1, DARK_SHARE * darkness, 1)
+    brightness *= np.where(darkness < 1, DARK_FACTOR * darkness, 1)
 
-    # Weak pulses return, but the device does not tell how bright they were.
+    # The device reports weak returns, but not how bright they were.
     if sensor.least_brightness:
         excess = (brightness - lasers.least_brightness[hits.ring]) / BRIGHTNESS_STEP
         brightness[_patchy(hits, rng) > expit(excess)] = 0
@@ -161,12 +164,12 @@ def _intensity(
 
 def _patchy(hits: Hits, rng: np.random.Generator) -> np.ndarray:
     """Return (N,) uniform random numbers that are alike for neighbouring hits."""
-    return ndtr(patchy_normal(rng, hits.places, *PATCH))
+    return ndtr(patchy_normal(rng, hits.places, *LOSS_PATCH))
 
 
 def _hits_own_car(hits: Hits, sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:
     """Return whether each pulse ends at the car itself: (N,) bool."""
-    could_hit = np.flatnonzero(hits.ring < OWN_LASERS)
+    could_hit = np.flatnonzero(hits.ring < OWN_CAR_LASERS)
     count = min(rng.poisson(sensor.own_returns), len(could_hit))
     is_own = np.zeros(len(hits.ring), dtype=bool)
     is_own[rng.choice(could_hit, count, replace=False)] = True
@@ -176,29 +179,29 @@ def _hits_own_car(hits: Hits, sensor: LidarModel, rng: np.random.Generator) -> n
 def _measured_distance(
     hits: Hits, sensor: LidarModel, relief: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return (N,) distances with the relief of the surfaces, mixed returns and range noise."""
+    """Return the (N,) distances in metres, with relief, mixed returns and range noise."""
     count = len(hits.distance)
-    height = patchy_normal(rng, hits.places, *TUFT)
+    height = patchy_normal(rng, hits.places, *RELIEF_PATCH)
     mixed = _mixed_distance(hits, sensor, rng)
     noise = rng.standard_normal(count, np.float32)
-    height *= relief * np.exp(RELIEF_SPREAD * patchy_normal(rng, hits.places, *MEADOW))
-    depth = height / np.maximum(hits.facing, LEAST_COSINE)
+    height *= relief * np.exp(RELIEF_SPREAD * patchy_normal(rng, hits.places, *MEAN_RELIEF_PATCH))
+    depth = height / np.maximum(hits.facing, MIN_COSINE)
     return mixed + depth + sensor.range_noise * noise
 
 
 def _mixed_distance(hits: Hits, sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:
-    """Return (N,) distances, some of which lie between the two surfaces of a depth edge.
+    """Return the (N,) distances in metres, where some at depth edges lie between both surfaces.
 
-    A beam is as wide as the angle to the next one, and so hits both.
+    A beam is as wide as the angle to the next beam, so that it hits both surfaces.
     """
     step = np.diff(hits.distance, append=hits.distance[-1:])
     next_direction = np.roll(hits.direction, -1, axis=0)
     cosine = (hits.direction * next_direction).sum(axis=1)
-    are_neighbours = cosine > np.cos(np.radians(NEIGHBOUR_ANGLE))
+    are_neighbours = cosine > np.cos(np.radians(MAX_NEIGHBOUR_ANGLE))
     are_neighbours &= hits.ring == np.roll(hits.ring, -1)
 
     depth = np.abs(step)
-    at_edge = are_neighbours & (depth > SMALLEST_MIXED_STEP) & (depth < LARGEST_MIXED_STEP)
+    at_edge = are_neighbours & (depth > MIN_MIXED_STEP) & (depth < MAX_MIXED_STEP)
     is_mixed = at_edge & (rng.random(len(step)) < sensor.mixed)
     return hits.distance + np.where(is_mixed, rng.random(len(step)) * step, 0)
 
@@ -206,9 +209,9 @@ def _mixed_distance(hits: Hits, sensor: LidarModel, rng: np.random.Generator) ->
 def _lost_returns(
     sensor: LidarModel, rings: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and rings for the shots that are missing in `rings`, as nuScenes has them.
+    """Return a point and a laser for each shot that is missing in `rings`, like nuScenes.
 
-    They lie within a metre of the sensor, most of them behind it on the left.
+    The points lie within a metre of the sensor; most lie behind it on the left.
     """
     missing = sensor.azimuth_steps - np.bincount(rings, minlength=len(sensor.elevations))
     lost_rings = np.repeat(np.arange(len(missing), dtype=np.uint8), missing)

@@ -1,4 +1,4 @@
-"""The LiDARs that can be simulated, each a table of numbers."""
+"""Define the LiDARs that can be simulated; sensors.toml has the numbers of each."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,118 +8,120 @@ import numpy as np
 from lidarstreets.errors import SimulationError
 from lidarstreets.tables import read_table
 
-# Largest difference between a device and its type, in standard deviations.
-MOST_DEVIATIONS = 2.5
+# Largest difference between the numbers of a device and of its type, in standard deviations.
+MAX_DEVIATIONS = 2.5
 
 
 @dataclass(frozen=True)
 class LidarModel:
     """The numbers that describe one LiDAR and the car that carries it."""
 
-    # Elevation of each laser in degrees, from the top down: points are written in this order.
+    # Elevation of each laser in degrees, from the top down; the points are written in this order.
     elevations: tuple[float, ...]
-    # Shots of each laser per rotation.
+    # Number of shots of each laser per rotation.
     azimuth_steps: int
     # Height above the ground in metres.
     height: float
-    # Smallest and largest range that is measured, in metres.
+    # Smallest and largest range that the device measures, in metres.
     min_range: float
     max_range: float
     # Standard deviation of the range in metres.
     range_noise: float
-    # Standard deviation between lasers of the constant error of their range, in metres.
+    # Each laser has a constant error of its range: standard deviation between lasers, in metres.
     range_error: float
-    # Range in metres at which half of the returns of a white surface hit head-on are lost.
+    # Range in metres at which half of the returns are lost, for a white surface hit head-on.
     reach: float
-    # Share of the returns at a depth edge that lie between the two surfaces.
+    # Share of the returns at a depth edge that lie between the two surfaces, 0 to 1.
     mixed: float
-    # A near surface hit head-on has the intensity gain * reflectivity ** gamma, rounded to
-    # `decimals`.
+    # A near surface hit head-on has the intensity `gain * reflectivity ** gamma`, rounded to
+    # `decimals` decimals.
     gain: float
     gamma: float
     decimals: int
     # Spread of the gains between lasers: scale of a Student's t distribution with three degrees
     # of freedom.
     gain_spread: float
-    # Power at which the device reports half of the reflectivity; 1 is the power of a head-on
-    # return from a white surface at 10 m.
+    # Power at which the device reports half of the reflectivity. A white surface hit head-on at
+    # 10 m returns the power 1.
     half_power: float
     # Seconds per rotation; the sensor looks ahead in the middle of it.
     rotation_period: float
-    # Direction of the rotation, seen from above.
+    # Whether the rotation is counter-clockwise seen from above.
     counter_clockwise: bool
-    # True if lost returns are written too, as points within a metre of the sensor.
+    # Whether a lost return is written as a point within a metre of the sensor.
     keeps_lost_returns: bool
-    # Layout of the files: semantickitti or nuscenes.
+    # Layout of the files, a key of `LAYOUTS`.
     layout: str
     # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
     shadow: tuple[tuple[float, float, float, float], ...]
-    # Share of the returns that are lost, whatever they hit.
+    # Share of the returns that are lost, whatever they hit, 0 to 1.
     drop: float = 0.01
-    # Elevations in degrees, rising, and the heights in metres above the origin of the coordinates
-    # from which lasers of these elevations look out.
+    # Pairs of a rising elevation in degrees and a height in metres: lasers of this elevation look
+    # out at this height over the origin of the coordinates.
     origins: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     # Range in metres at which the device reports half of the reflectivity, whatever the power.
     half_range: float = np.inf
-    # Ranges in metres, rising, and the factors on the brightness of returns at these ranges.
+    # Pairs of a rising range in metres and the factor on the brightness of returns at this range.
     response: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
-    # Brightness below which most returns to the upper half of the lasers have the intensity 0; 0 if
-    # there is no such limit.
+    # Brightness below which the upper half of the lasers reports most returns with the intensity 0;
+    # 0 is no such limit.
     least_brightness: float = 0.0
-    # Mean share of the brightness of near surfaces that the upper half of the lasers loses: they
-    # are focused far away.
+    # Mean share of the brightness of near surfaces that the upper half of the lasers loses, because
+    # these lasers are focused far away; 0 to 1.
     near_loss: float = 0.0
-    # Mean number of returns from the racks and the roof of the car itself.
+    # Mean number of returns of a scan that come from the racks and the roof of the car itself.
     own_returns: float = 0.0
     # Factor on the noise of the intensity, `Reflection.spread`.
     intensity_noise: float = 1.0
-    # True if the motion of the sensor during a rotation is removed from the points.
+    # Whether the motion of the sensor during a rotation is removed from the points.
     motion_corrected: bool = True
     # Angles in degrees between the device and the car: nose up, and left side up.
     pitch: float = 0.0
     roll: float = 0.0
-    # How much these numbers differ between drives: standard deviations of the height in metres, of
-    # the mounting angles in degrees, of the elevations of all lasers together and of each laser in
-    # degrees, and of the logarithms of `range_noise`, `range_error`, `drop` and `gain_spread`;
-    # `gain` varies by a twelfth of it, as makers calibrate it.
+    # The other numbers differ between drives. Standard deviation of the height in metres:
     height_spread: float = 0.0
+    # Standard deviation of `pitch` and of `roll` in degrees.
     mounting_spread: float = 0.6
+    # Standard deviation of the offset that the elevations of all lasers share, in degrees.
     elevation_spread: float = 0.15
+    # Standard deviation of the elevation of each laser, in degrees.
     laser_spread: float = 0.04
+    # Standard deviation of the logarithms of `range_noise`, `range_error`, `drop` and
+    # `gain_spread`. For `gain`, which makers calibrate, it is multiplied by 0.08.
     response_spread: float = 0.35
 
 
 _TABLE = read_table(Path(__file__).with_suffix(".toml"))
-SENSORS = {name: LidarModel(**row) for name, row in _TABLE.items()}
+LIDAR_MODELS = {name: LidarModel(**row) for name, row in _TABLE.items()}
 
 
 def sensor_of(name: str) -> LidarModel:
-    """Return the sensor of a name.
+    """Return the LiDAR with a name.
 
     Raises:
-        SimulationError: if there is none.
+        SimulationError: if `LIDAR_MODELS` has no such name.
     """
-    if name not in SENSORS:
-        names = ", ".join(SENSORS)
+    if name not in LIDAR_MODELS:
+        names = ", ".join(LIDAR_MODELS)
         raise SimulationError(
             f"sensor: expected one of {names}, found {name!r}; choose one of them"
         )
-    return SENSORS[name]
+    return LIDAR_MODELS[name]
 
 
 def draw_device(sensor: LidarModel, rng: np.random.Generator) -> LidarModel:
-    """Return one device of a type of LiDAR as it is mounted on one car.
+    """Draw one device of a type of LiDAR, mounted on one car.
 
-    Its numbers differ from the type's by at most `MOST_DEVIATIONS` standard deviations. If all
-    spreads of a type are 0, its devices are equal to it.
+    The numbers of the device differ from the numbers of its type by at most `MAX_DEVIATIONS`
+    standard deviations. If all spreads of a type are 0, its devices equal the type.
     """
 
     def draw() -> float:
-        return float(np.clip(rng.standard_normal(), -MOST_DEVIATIONS, MOST_DEVIATIONS))
+        return float(np.clip(rng.standard_normal(), -MAX_DEVIATIONS, MAX_DEVIATIONS))
 
     offset = sensor.elevation_spread * draw()
     deviations = rng.standard_normal(len(sensor.elevations))
-    deviations = np.clip(deviations, -MOST_DEVIATIONS, MOST_DEVIATIONS)
+    deviations = np.clip(deviations, -MAX_DEVIATIONS, MAX_DEVIATIONS)
     elevations = np.array(sensor.elevations) + offset + sensor.laser_spread * deviations
 
     return replace(

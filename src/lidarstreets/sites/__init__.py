@@ -1,1 +1,1 @@
-"""Streets filled with bodies: plots, open areas, boundaries, vehicles and people."""
+"""Fill streets with bodies: plots, open areas, boundaries, vehicles and people."""

@@ -1,4 +1,4 @@
-"""Open areas next to a street: car parks, yards and squares."""
+"""Add open areas next to a street: car parks, yards and squares."""
 
 import numpy as np
 
@@ -12,18 +12,25 @@ from lidarstreets.sites.site import Plot, Site
 from lidarstreets.sites.traffic import car_with_trailer, choose_vehicle, length_of
 from lidarstreets.solids import box
 
-# Open areas per 100 m of street on each side.
-AREAS = {"urban": 0.24, "avenue": 0.24, "residential": 0.13, "living": 0.16, "rural": 0.10}
-# Metres from the front of a car park to the middle of its aisle, and of its two rows from there.
-AISLE = 9.0
-ROW = 5.8
+# Mean number of open areas per 100 m of street on each side, by kind of street.
+AREAS_PER_100_M = {
+    "urban": 0.24,
+    "avenue": 0.24,
+    "residential": 0.13,
+    "living": 0.16,
+    "rural": 0.10,
+}
+# Distance of the middle of the aisle from the front of a car park, and of the middle of each row
+# from the middle of the aisle, metres.
+AISLE_DISTANCE = 9.0
+ROW_DISTANCE = 5.8
 
 
 def add_areas(site: Site) -> None:
     """Reserve open areas along the street and fill them."""
     rng = site.rng
     ground = site.ground
-    rate = AREAS.get(ground.style.kind, 0.0) * ground.length / 100
+    rate = AREAS_PER_100_M.get(ground.style.kind, 0.0) * ground.length / 100
 
     for side in (-1, 1):
         for _ in range(rng.poisson(rate)):
@@ -38,7 +45,7 @@ def add_areas(site: Site) -> None:
 
 
 def has_room(area: Plot, depth: float) -> bool:
-    """Return whether no side road and no other area lies within an area `depth` metres deep."""
+    """Return whether an area `depth` metres deep overlaps no side road and no other area."""
     site = area.site
     if not (site.ground.is_street(area.x, 5) and site.ground.is_street(area.end, 5)):
         return False
@@ -49,13 +56,13 @@ def has_room(area: Plot, depth: float) -> bool:
 
 
 def _pave(area: Plot, depth: float, chances: dict[Label, float]) -> None:
-    """Make a whole area ground of a random class."""
+    """Make the ground of an area one class, drawn by its chance."""
     label = weighted_choice(area.rng, chances)
     area.pave((area.x, area.end), (area.front, area.front + depth), label)
 
 
 def add_lot(area: Plot, depth: float) -> None:
-    """Add a car park: rows of vehicles on both sides of an aisle, perhaps islands with trees."""
+    """Add a car park: rows of vehicles on one or both sides of an aisle, and a few trees."""
     rng = area.rng
     front = area.front
     chances = {Label.PARKING: 0.85, Label.OTHER_GROUND: 0.10, Label.SIDEWALK: 0.05}
@@ -64,7 +71,11 @@ def add_lot(area: Plot, depth: float) -> None:
     taken = rng.uniform(0.15, 0.95)
     angle = np.pi / 2 if rng.random() < 0.7 else rng.uniform(0.8, 1.3)
     pitch = rng.uniform(2.5, 3.1) / np.sin(angle)
-    rows = [AISLE - ROW] if depth < AISLE + ROW + 2 else [AISLE - ROW, AISLE + ROW]
+    rows = (
+        [AISLE_DISTANCE - ROW_DISTANCE]
+        if depth < AISLE_DISTANCE + ROW_DISTANCE + 2
+        else [AISLE_DISTANCE - ROW_DISTANCE, AISLE_DISTANCE + ROW_DISTANCE]
+    )
 
     for row in rows:
         for x in np.arange(area.x + 1.8, area.end - 1.5, pitch):
@@ -102,7 +113,7 @@ def add_yard(area: Plot, depth: float) -> None:
 
 
 def _put_large(area: Plot, x: float, distance: float, heading: float) -> float:
-    """Put a vehicle or a container behind x along the street; return its length."""
+    """Put a vehicle or a container that begins at x along the street; return its length."""
     rng = area.rng
     yaw = heading + np.pi * (rng.random() < 0.5) + rng.normal(scale=0.1)
     if rng.random() < 0.15:
@@ -144,7 +155,7 @@ def add_square(area: Plot, depth: float) -> None:
 
 
 def _put_people(area: Plot, depth: float, mean: float) -> None:
-    """Put people and groups of people anywhere in an area; `mean` is their average number."""
+    """Put people and groups of people anywhere in an area; on average there are `mean` of both."""
     rng = area.rng
     for _ in range(rng.poisson(mean)):
         x = rng.uniform(area.x, area.end)

@@ -1,18 +1,18 @@
-"""Closes off the view: behind the plots, at the ends of a street and along its side roads."""
+"""Close off the view behind the plots, at the ends of a street and along its side roads."""
 
 import numpy as np
 
 from lidarstreets.bodies import buildings, plants, trees
 from lidarstreets.mesh import Mesh
-from lidarstreets.sites.boundaries import SEGMENT, draw_boundary
+from lidarstreets.sites.boundaries import SEGMENT_LENGTH, draw_boundary
 from lidarstreets.sites.land import plant_thickets
 from lidarstreets.sites.site import Plot, Site
 from lidarstreets.streets.plans import SideRoad
 from lidarstreets.streets.styles import width_of
 
-# Metres between the trees, houses and copses of the second row, along the street.
+# Distance between the trees, houses and copses behind the plots, metres along the street.
 BACKGROUND_STEP = 14.0
-# Kinds of streets with houses behind the plots and along side roads.
+# Kinds of streets that have houses behind the plots and along side roads.
 BUILT_UP = ("residential", "urban", "living", "avenue")
 
 
@@ -75,19 +75,19 @@ def close_ends(site: Site) -> None:
 
         is_wild = rng.random() < 0.33
         boundary = draw_boundary(rng)
-        for t in np.arange(-reach, reach, SEGMENT) + SEGMENT / 2:
+        for t in np.arange(-reach, reach, SEGMENT_LENGTH) + SEGMENT_LENGTH / 2:
             away = rng.uniform(1.5, 2.0)
             if is_wild:
                 site.put(plants.bush(rng, rng.uniform(0.8, 1.8)), x + outwards * away, t, np.pi / 2)
                 continue
 
             for layer, offset in boundary.layers:
-                segment = layer.segment(rng, SEGMENT)
+                segment = layer.segment(rng, SEGMENT_LENGTH)
                 site.put(segment, x + outwards * (away + offset), t, np.pi / 2)
 
 
 def line_side_road(site: Site, road: SideRoad, side: int) -> None:
-    """Put hedges, walls, fences, trees and houses along one side of a side road."""
+    """Put hedges, walls, fences, trees and houses along one side (-1 or 1) of a side road."""
     rng = site.rng
     ground = site.ground
     if ground.style.kind == "motorway":
@@ -99,9 +99,9 @@ def line_side_road(site: Site, road: SideRoad, side: int) -> None:
 
     if rng.random() < 0.75:
         boundary = draw_boundary(rng)
-        for along in np.arange(first, last, SEGMENT):
+        for along in np.arange(first, last, SEGMENT_LENGTH):
             for layer, offset in boundary.layers:
-                segment = layer.segment(rng, SEGMENT)
+                segment = layer.segment(rng, SEGMENT_LENGTH)
                 _put_along(site, road, segment, along, side * (edge + 0.4 + offset))
 
     has_houses = ground.style.kind in BUILT_UP
@@ -121,7 +121,11 @@ def line_side_road(site: Site, road: SideRoad, side: int) -> None:
 def _put_along(
     site: Site, road: SideRoad, mesh: Mesh, along: float, across: float, reach: float = 1.0
 ) -> None:
-    """Put a body next to a side road, unless the street or another road is within its reach."""
+    """Put a body next to a side road, unless the street or a side road is within its reach.
+
+    `along` and `across` are the body's coordinates on the side road, and `reach` is its radius;
+    all are in metres.
+    """
     ground = site.ground
     px, py, yaw = road.pose_at(along, across)
     x = np.array([px])

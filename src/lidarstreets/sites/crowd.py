@@ -1,4 +1,4 @@
-"""People, riders and parked two-wheelers along a street."""
+"""Add people, riders and parked two-wheelers along a street."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,10 +15,9 @@ from lidarstreets.solids import box
 from lidarstreets.tables import read_table
 
 OCCASIONS = read_table(Path(__file__).with_suffix(".toml"))["occasions"]
-# Occasions per person that `Style.people` counts, and parked two-wheelers per such person.
-PEOPLE_FACTOR = 0.9
-TWO_WHEELER_FACTOR = 0.6
-END_MARGIN = 2.0  # metres: nobody is nearer to the end of a street
+PEOPLE_FACTOR = 0.9  # number of occasions for each person that `Style.people` counts
+TWO_WHEELER_FACTOR = 0.6  # number of two-wheelers or racks for each person of `Style.people`
+END_MARGIN = 2.0  # smallest distance of people from the end of a street, metres
 
 
 def add_people(site: Site) -> None:
@@ -31,7 +30,10 @@ def add_people(site: Site) -> None:
 
 
 def _random_places(site: Site, rate: float) -> Iterator[tuple[int, float]]:
-    """Yield random sides and x along the street, about `rate` less those beyond its ends."""
+    """Yield random sides (-1 or 1) and x along the street, on average at most `rate` of them.
+
+    A place beyond an end of the street is left out.
+    """
     rng = site.rng
     for _ in range(rng.poisson(rate)):
         side = int(rng.choice([-1, 1]))
@@ -41,7 +43,7 @@ def _random_places(site: Site, rate: float) -> Iterator[tuple[int, float]]:
 
 
 def _add_occasion(site: Site, occasion: str, side: int, x: float) -> None:
-    """Add the people of one of `OCCASIONS` on a side of the street at x."""
+    """Add the people of an occasion, a key of `OCCASIONS`, on a side of the street at x."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -84,7 +86,7 @@ def _add_occasion(site: Site, occasion: str, side: int, x: float) -> None:
 
 
 def park_two_wheelers(site: Site) -> None:
-    """Put bicycles and motorcycles at the fronts of plots, at the kerb and on racks."""
+    """Park bicycles and motorcycles at the fronts of plots, at the kerb and on racks."""
     rng = site.rng
     ground = site.ground
     rate = TWO_WHEELER_FACTOR * ground.style.people * ground.length / 100
@@ -109,7 +111,7 @@ def park_two_wheelers(site: Site) -> None:
 
 
 def put_rack(site: Site, make: Maker, x: float, t: float, places: int) -> None:
-    """Put two-wheelers side by side at a rack, some of its places empty."""
+    """Put two-wheelers side by side at a rack; some of its `places` stay empty."""
     rng = site.rng
     pitch = rng.uniform(0.45, 0.8) if make is two_wheelers.bicycle else rng.uniform(0.8, 1.2)
     yaw = np.pi / 2 + rng.normal(scale=0.3)

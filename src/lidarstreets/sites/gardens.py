@@ -1,4 +1,4 @@
-"""Fills plots with houses: single ones in gardens, and rows along the sidewalk."""
+"""Fill plots with houses: single houses in gardens, and rows along the sidewalk."""
 
 from dataclasses import replace
 
@@ -104,7 +104,7 @@ def _add_drive(plot: Plot, x: float, depth: float) -> None:
 
 
 def fill_row(plot: Plot) -> None:
-    """Put a house that fills the width of the plot, with a paved front."""
+    """Put one to three houses across the whole width of a plot, and pave the ground before them."""
     rng = plot.rng
     style = plot.style
     front = plot.front

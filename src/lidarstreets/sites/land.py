@@ -1,4 +1,4 @@
-"""Fills plots with open land: woods, meadows, fields, orchards, allotments, parks, railways."""
+"""Fill plots with open land: woods, meadows, fields, orchards, allotments, parks, railways."""
 
 from collections.abc import Callable
 
@@ -10,9 +10,9 @@ from lidarstreets.materials import Label
 from lidarstreets.sites.boundaries import draw_boundary, line_up
 from lidarstreets.sites.site import Plot
 
-MEADOW_TILE = 5.0  # metres: side of a patch of uncut grass, which lies flat on the ground
-COVER_TILE = 3.0  # metres: side of a patch of low plants
-# Functions that fill a plot, and their shares.
+MEADOW_TILE = 5.0  # side of a square patch of uncut grass, metres
+COVER_TILE = 3.0  # side of a square patch of low plants, metres
+# Functions that fill a plot, with their shares.
 _Fillers = dict[Callable[[Plot], None], float]
 
 
@@ -23,7 +23,7 @@ def fill_wood(plot: Plot) -> None:
 
 
 def fill_field(plot: Plot) -> None:
-    """Leave open land: a meadow, a crop field, allotments, a railway line or a playground."""
+    """Fill a plot with open land, such as a meadow, a field, allotments or a building site."""
     fillers: _Fillers = {
         _meadow: 0.62,
         _crop_field: 0.12,
@@ -61,7 +61,7 @@ def _wood(plot: Plot) -> None:
 
 
 def _wood_edge(plot: Plot) -> None:
-    """Plant a high wall of leaves with stems in it, behind a strip of grass or a bank."""
+    """Plant a high wall of leaves with stems in it, behind a strip of grass or bushes."""
     rng = plot.rng
     front = plot.front
 
@@ -118,7 +118,7 @@ def _park(plot: Plot) -> None:
 
 
 def _meadow(plot: Plot) -> None:
-    """Leave open ground: a meadow or gravel, with a few bushes, perhaps a fence and a barn."""
+    """Make a plot a meadow or gravel with a few bushes, perhaps with a fence and a barn."""
     rng = plot.rng
     front = plot.front
 
@@ -236,7 +236,7 @@ def _building_site(plot: Plot) -> None:
 
 
 def _fence_off(plot: Plot, distance: float) -> None:
-    """Put a fence along a plot, at a distance from the middle line of the street."""
+    """Put a fence along a plot, `distance` metres from the middle line of the street."""
     boundary = draw_boundary(plot.rng, "open")
     drift = plot.rng.normal(scale=0.4)
     line_up(plot, boundary, (plot.x, distance), (plot.end, distance + drift))
@@ -256,7 +256,7 @@ def _lay_turf(plot: Plot, near: float, far: float) -> None:
         for distance in np.arange(near, min(far, near + 20), MEADOW_TILE) + MEADOW_TILE / 2:
             if rng.random() < 0.85:
                 tile = plants.turf(rng, size, height, tint=_ground_tint(plot, x, distance))
-                plot.put_as_is(tile, x, distance, margin=3.0)
+                plot.put_piece(tile, x, distance, margin=3.0)
 
 
 def grow_cover(plot: Plot, near: float, far: float) -> None:
@@ -270,7 +270,7 @@ def grow_cover(plot: Plot, near: float, far: float) -> None:
         for distance in np.arange(near, min(far, near + 15), COVER_TILE) + COVER_TILE / 2:
             if rng.random() < filled:
                 tile = plants.ground_cover(rng, COVER_TILE, height * rng.uniform(0.5, 1.5))
-                plot.put_as_is(tile, x, distance, margin=2.0)
+                plot.put_piece(tile, x, distance, margin=2.0)
 
 
 def _ground_tint(plot: Plot, x: float, distance: float) -> float:
@@ -280,13 +280,16 @@ def _ground_tint(plot: Plot, x: float, distance: float) -> float:
 
 
 def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> None:
-    """Plant undergrowth along a street, its height (drawn if None) changing slowly, with gaps."""
+    """Plant undergrowth along a street, perhaps with gaps.
+
+    It begins `height` metres high, or as high as drawn if that is None, and changes slowly.
+    """
     rng = plot.rng
     thicket = plants.draw_thicket(rng)
     change = rng.choice([0.1, 0.5])
     filled = rng.choice([0.85, 1.0])
 
-    # What lies under and behind undergrowth is also called vegetation.
+    # The ground under and behind undergrowth also has the class vegetation.
     if rng.random() < 0.7:
         plot.overgrow(distance - rng.uniform(0.2, 1.5), distance + rng.uniform(1, 10))
 
@@ -297,11 +300,11 @@ def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> 
         height = float(np.clip(height + rng.normal(scale=change), 0.8, highest))
         if rng.random() < filled:
             piece = thicket.segment(rng, 4.0, height)
-            plot.put_as_is(piece, x, distance + rng.normal(scale=0.2), margin=2.5)
+            plot.put_piece(piece, x, distance + rng.normal(scale=0.2), margin=2.5)
 
 
 def plant_bushes(plot: Plot, count: int, depth: float = 6.0) -> None:
-    """Plant some bushes within `depth` metres of the front of a plot."""
+    """Plant `count` bushes within `depth` metres of the front of a plot."""
     rng = plot.rng
     for _ in range(count):
         distance = plot.front + rng.uniform(0.8, max(depth, 1.5))

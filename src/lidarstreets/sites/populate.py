@@ -1,4 +1,4 @@
-"""Fills a street with everything that stands and moves in it."""
+"""Fill a street with everything that stands and moves in it."""
 
 import numpy as np
 
@@ -21,22 +21,24 @@ from lidarstreets.sites.traffic import (
 )
 from lidarstreets.sites.yards import fill_yard
 
-WORK_ZONES = 0.25  # work zones per 100 m of street
-# Metres between the barriers and between the cones of a work zone.
-WORK_BARRIER_STEP = 2.05
-CONE_STEP = 3.0
+WORK_ZONES_PER_100_M = 0.25  # mean number of work zones per 100 m of street
+WORK_BARRIER_STEP = 2.05  # distance between the barriers of a work zone, metres
+CONE_STEP = 3.0  # distance between the cones of a work zone, metres
 
-# Chance of a long barrier or fence along one side of a street, by the kind of street.
-LONG_BARRIER = {"fast": 0.65, "rural": 0.25, "residential": 0.05, "urban": 0.05}
-# Chances of a gantry and of a bridge over a street.
-GANTRY = {"fast": 0.35, "urban": 0.04}
-BRIDGE = 0.05
+# Chance of a long barrier or fence along one side of a street, by kind of street.
+LONG_BARRIER_CHANCE = {"fast": 0.65, "rural": 0.25, "residential": 0.05, "urban": 0.05}
+# Chance of a gantry over a street, by kind of street.
+GANTRY_CHANCE = {"fast": 0.35, "urban": 0.04}
+BRIDGE_CHANCE = 0.05  # chance of a bridge over a street that has no gantry
 
 
 def populate(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
     """Fill a street with everything that stands and moves in it.
 
-    `ego` is x and t of the car with the sensor at time 0: nothing in its lane starts near it.
+    Args:
+        site: the street.
+        ego_speed: speed of the car with the sensor, metres per second.
+        ego: x and t of the car with the sensor at time 0; no body in its lane starts near it.
     """
     ground = site.ground
     add_areas(site)
@@ -90,7 +92,7 @@ def _add_long_barrier(site: Site, side: int) -> None:
     """Put a guard rail, a noise barrier or a fence along a long stretch of a street."""
     rng = site.rng
     kind = site.ground.style.kind
-    if rng.random() > LONG_BARRIER.get(kind, 0.1):
+    if rng.random() > LONG_BARRIER_CHANCE.get(kind, 0.1):
         return
 
     length = site.ground.length * rng.uniform(0.3, 1.0)
@@ -127,18 +129,18 @@ def _add_overhead(site: Site) -> None:
     clear = ground.front(-1) + ground.front(1) + 2.0
     x = rng.uniform(0.3, 0.7) * ground.length
     offset = (ground.front(1) - ground.front(-1)) / 2
-    if rng.random() < GANTRY.get(ground.style.kind, 0.0):
+    if rng.random() < GANTRY_CHANCE.get(ground.style.kind, 0.0):
         site.put(furniture.gantry(rng, clear), x, offset, margin=3.0)
-    elif rng.random() < BRIDGE:
+    elif rng.random() < BRIDGE_CHANCE:
         site.put(clutter.bridge(rng, clear), x, offset, margin=12.0)
 
 
 def _add_work_zones(site: Site) -> None:
-    """Put rows of barriers or cones at the edge of the road, some with a machine behind them."""
+    """Put rows of barriers or cones at the edge of the road, some with a machine and workers."""
     rng = site.rng
     ground = site.ground
 
-    for _ in range(rng.poisson(WORK_ZONES * ground.length / 100)):
+    for _ in range(rng.poisson(WORK_ZONES_PER_100_M * ground.length / 100)):
         side = int(rng.choice([-1, 1]))
         start = rng.uniform(0, ground.length)
         edge = side * (ground.kerb_t(side) - 0.4)

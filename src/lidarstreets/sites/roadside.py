@@ -1,4 +1,4 @@
-"""Puts lamps, signs, trees, crash barriers and other furniture along a road and on its islands."""
+"""Put lamps, signs, trees, crash barriers and other furniture along a road and on its islands."""
 
 import numpy as np
 
@@ -8,25 +8,24 @@ from lidarstreets.sites.site import Site
 from lidarstreets.sites.traffic import along_road
 from lidarstreets.streets.plans import Roundabout
 
-# Furniture per 100 m of street on each side.
+# Mean numbers of pieces of furniture per 100 m of street on each side.
 SIGNS = 3.0
 POSTS = 0.5
-SLENDER_BUSHES = 0.8  # times `Style.green`
+SLENDER_BUSHES = 0.8  # multiplied by `Style.green`
 CLUTTER = 1.6
 SHELTERS = 0.15
-# Direction boards per 100 m on each side of the streets of a kind.
+# Mean number of direction boards per 100 m of street on each side, by kind of street.
 BOARDS = {"motorway": 0.35, "fast": 0.35, "rural": 0.12, "avenue": 0.12, "urban": 0.05}
-# Share of the streets of a kind with a crash barrier along one side.
-GUARD_RAIL = {"motorway": 0.75, "fast": 0.6, "rural": 0.15}
-# Metres: distance between the segments of crash barriers, and by how much two of steel and two of
-# concrete overlap, so that no gap shows in a bend.
-BARRIER_STEP = 4.0
+# Chance of a crash barrier along one side of a street, by kind of street.
+GUARD_RAIL_CHANCE = {"motorway": 0.75, "fast": 0.6, "rural": 0.15}
+BARRIER_STEP = 4.0  # distance between the segments of a crash barrier, metres
+# Overlap of two segments, so that no gap shows in a bend, metres.
 RAIL_OVERLAP = 0.1
 CONCRETE_OVERLAP = 0.05
 
 
 def fill_roadside(site: Site, side: int) -> None:
-    """Put lamps, trees, signs, posts, bins, shelters and perhaps a crash barrier along the road."""
+    """Put lamps, trees, signs, posts, shelters and perhaps a crash barrier along one side."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -72,7 +71,7 @@ def _put_guard_rail(site: Site, side: int) -> None:
     style = ground.style
     yaw = along_road(side)
 
-    if rng.random() >= GUARD_RAIL.get(style.kind, 0.0):
+    if rng.random() >= GUARD_RAIL_CHANCE.get(style.kind, 0.0):
         return
 
     t = side * (style.road / 2 + rng.uniform(0.5, 0.9))
@@ -83,7 +82,7 @@ def _put_guard_rail(site: Site, side: int) -> None:
 
 
 def _put_on_street(site: Site, mesh: Mesh, x: float, t: float, yaw: float) -> None:
-    """Put a body at x, t if the street passes x."""
+    """Put a body at street coordinates x, t, unless x is beyond an end of the street."""
     if site.ground.is_street(x):
         site.put(mesh, x, t, yaw)
 
@@ -130,7 +129,10 @@ def fill_islands(site: Site) -> None:
 
 
 def _put_barriers(site: Site, x: tuple[float, float], t: float, kind: str) -> None:
-    """Put a crash barrier at t between two x: of steel on both sides if "rail", else concrete."""
+    """Put a crash barrier at t from `x[0]` to `x[1]` along the street.
+
+    If `kind` is "rail", it is a steel rail on each side, otherwise a concrete barrier.
+    """
     rail = fences.guard_rail(BARRIER_STEP + RAIL_OVERLAP)
     concrete = furniture.barrier(BARRIER_STEP + CONCRETE_OVERLAP)
     for middle in np.arange(x[0], x[1], BARRIER_STEP):

@@ -1,4 +1,4 @@
-"""A street, the land along it, and the bodies that have been put there."""
+"""Put bodies into a street and onto the land along it."""
 
 from dataclasses import dataclass, field, replace
 
@@ -10,22 +10,22 @@ from lidarstreets.streets.ground import Ground
 from lidarstreets.streets.plans import Patch
 from lidarstreets.streets.styles import Style
 
-# Metres: half the length of the longest body that may cover the sensor, the height up to which
-# bodies are in its way, and how near to it bodies that stand and bodies that move may be.
-LONGEST_BODY = 30.0
-OBSTACLE_HEIGHT = 2.2
-CLEARANCE = 2.1
-MOVING_CLEARANCE = 1.4
+HALF_LONGEST_BODY = 30.0  # half the length of the longest body that may cover the sensor, metres
+OBSTACLE_HEIGHT = 2.2  # height up to which bodies are in the way of the sensor, metres
+CLEARANCE = 2.1  # smallest distance of the sensor from bodies that stand, metres
+MOVING_CLEARANCE = 1.4  # smallest distance of the sensor from bodies that move, metres
 
 
 @dataclass(frozen=True)
 class Mover:
-    """A body that follows the street at a constant speed and re-enters at the start after the end.
+    """A body that follows the street at a constant speed.
+
+    At the end of the street, it re-enters at the start.
 
     Attributes:
         mesh: the body, with its moving class and its instance.
-        x: street coordinate along the street at time 0.
-        t: street coordinate across it.
+        x: its street coordinate along the street at time 0, metres.
+        t: its street coordinate across the street, metres.
         speed: metres per second along +x; negative if it comes towards the sensor.
     """
 
@@ -35,16 +35,16 @@ class Mover:
     speed: float
 
     def place(self, ground: Ground, time: float) -> float:
-        """Return its x along the street at a time."""
+        """Return its x along the street at a time in seconds."""
         return (self.x + self.speed * time) % ground.length
 
     def at(self, ground: Ground, time: float) -> Mesh:
-        """Return the body at its place at a time."""
+        """Return the body where it is at a time in seconds."""
         x, y, yaw = self.pose_at(ground, time)
         return place(self.mesh, x, y, float(ground.height(x, y)), yaw)
 
     def pose_at(self, ground: Ground, time: float) -> tuple[float, float, float]:
-        """Return its (x, y, yaw) at a time."""
+        """Return its (x, y, yaw) at a time in seconds, in metres and radians."""
         x, y, yaw = ground.lane_pose(self.place(ground, time), self.t)
         if self.speed < 0:
             yaw += np.pi
@@ -57,8 +57,8 @@ class Site:
 
     Attributes:
         ground: the street.
-        rng: draws everything.
-        course: (P, 2) x and y of the sensor at each scan: no body covers them.
+        rng: draws everything in the street.
+        course: (P, 2) x and y of the sensor at each of P scans, metres; no body covers them.
         fixed: bodies that stand still.
         movers: bodies that move.
         instances: number of instance ids in use.
@@ -72,7 +72,10 @@ class Site:
     instances: int = 0
 
     def is_free(self, x: float, t: float, margin: float) -> bool:
-        """Return whether no side road and no reserved stretch is within the margin of a place."""
+        """Return whether a place x, t is farther than `margin` metres from what must stay free.
+
+        Side roads and reserved stretches of the street must stay free.
+        """
         if margin == -np.inf:
             return True
         for side, start, stop in self.ground.reserved:
@@ -93,9 +96,15 @@ class Site:
         thing: bool = False,
         margin: float = 0.8,
     ) -> None:
-        """Put a body at street coordinates, unless a side road is within the margin in metres.
+        """Put a body at street coordinates, unless the place is not free.
 
-        The yaw is relative to the street. A `thing` gets an instance id.
+        Args:
+            mesh: the body.
+            x: street coordinate along the street, metres.
+            t: street coordinate across the street, metres.
+            yaw: its direction relative to the street, radians.
+            thing: whether it gets an instance id.
+            margin: smallest distance from side roads and reserved stretches, metres; see `is_free`.
         """
         if not self.is_free(x, t, margin):
             return
@@ -104,7 +113,10 @@ class Site:
         self.put_at(mesh, px, py, heading + yaw, thing=thing)
 
     def put_at(self, mesh: Mesh, x: float, y: float, yaw: float, *, thing: bool = False) -> None:
-        """Put a body on the ground at x, y, unless it would cover the course of the sensor."""
+        """Put a body on the ground at x, y, unless it would cover the course of the sensor.
+
+        The yaw is in the frame of the street's mesh, in radians. A `thing` gets an instance id.
+        """
         if covers(mesh, (x, y, yaw), self.course, CLEARANCE):
             return
 
@@ -132,7 +144,7 @@ class Plot:
 
     Attributes:
         site: the street.
-        side: -1 right, 1 left.
+        side: side of the street: -1 is right, 1 is left.
         x: where the plot begins along the street, metres.
         width: its width along the street, metres.
     """
@@ -154,12 +166,12 @@ class Plot:
 
     @property
     def front(self) -> float:
-        """Distance from the middle line of the street at which the plot begins."""
+        """Distance from the middle line of the street at which the plot begins, metres."""
         return self.site.ground.front(self.side)
 
     @property
     def middle(self) -> float:
-        """Middle of the plot along the street."""
+        """Middle of the plot along the street, metres."""
         return self.x + self.width / 2
 
     @property
@@ -169,7 +181,7 @@ class Plot:
 
     @property
     def facing(self) -> float:
-        """Yaw of a body whose front, -y, faces the street."""
+        """Yaw of a body whose front, -y, faces the street, radians relative to the street."""
         return 0.0 if self.side > 0 else np.pi
 
     def random_x(self) -> float:
@@ -186,13 +198,13 @@ class Plot:
         thing: bool = False,
         margin: float = 0.8,
     ) -> None:
-        """Put a body at a distance from the middle line of the street; see `Site.put`."""
+        """Put a body `distance` metres from the middle line of the street; see `Site.put`."""
         self.site.put(mesh, x, self.side * distance, yaw, thing=thing, margin=margin)
 
-    def put_as_is(
+    def put_piece(
         self, mesh: Mesh, x: float, distance: float, yaw: float = 0.0, margin: float = 0.8
     ) -> None:
-        """Put a piece of a larger body, which has one brightness; see `put`."""
+        """Put a piece of a larger body; see `put`. Its tint stays like the tint of other pieces."""
         t = self.side * distance
         if self.site.is_free(x, t, margin):
             px, py, heading = self.site.ground.pose_at(x, t)
@@ -200,14 +212,20 @@ class Plot:
             self.site.fixed.append(place(mesh, px, py, z, heading + yaw))
 
     def pave(self, x: tuple[float, float], distance: tuple[float, float], label: Label) -> None:
-        """Make a rectangle ground of another class; `distance` is from the middle line."""
+        """Give a rectangle of the ground another class.
+
+        Args:
+            x: from and to, along the street, metres.
+            distance: from and to, metres from the middle line.
+            label: class of the ground.
+        """
         near, far = sorted((self.side * distance[0], self.side * distance[1]))
         self.site.ground.patches.append(Patch(x, (near, far), label))
 
     def overgrow(self, near: float, far: float) -> None:
-        """Make the ground between two distances from the middle line vegetation.
+        """Give the ground between two distances from the middle line the class vegetation.
 
-        It is drawn as the ground of the plot, so what is paved earlier or later lies on it.
+        What `pave` paves, earlier or later, lies above it.
         """
         t = sorted((self.side * near, self.side * far))
         patch = Patch((self.x, self.end), (t[0], t[1]), Label.VEGETATION)
@@ -217,13 +235,16 @@ class Plot:
 def covers(
     mesh: Mesh, pose: tuple[float, float, float], places: np.ndarray, clearance: float
 ) -> bool:
-    """Return whether a body at (x, y, yaw) is within the clearance of one of (P, 2) places."""
+    """Return whether a body at (x, y, yaw) is nearer than `clearance` metres to any of P places.
+
+    The places are (P, 2) x and y in metres. Parts of the body above `OBSTACLE_HEIGHT` do not count.
+    """
     x, y, yaw = pose
     offset = places - np.array([x, y])
-    if not len(offset) or np.abs(offset).sum(axis=1).min() > LONGEST_BODY:
+    if not len(offset) or np.abs(offset).sum(axis=1).min() > HALF_LONGEST_BODY:
         return False
 
-    # Crowns and arms over the road are no obstacle.
+    # Crowns of trees and arms of lamps over the road are no obstacles.
     corners = mesh.triangles.reshape(-1, 3)
     corners = corners[corners[:, 2] < OBSTACLE_HEIGHT, :2]
     if not len(corners):

@@ -1,4 +1,4 @@
-"""Vehicles along a street: parked at its sides, waiting in side roads, and driving."""
+"""Add vehicles along a street: parked at its sides, waiting in side roads, and driving."""
 
 from pathlib import Path
 
@@ -14,8 +14,8 @@ from lidarstreets.sites.site import Site
 from lidarstreets.streets.plans import SideRoad
 from lidarstreets.tables import read_table
 
-SHARES = read_table(Path(__file__).with_suffix(".toml"))
-MAKERS: dict[str, Maker] = {
+VEHICLE_SHARES = read_table(Path(__file__).with_suffix(".toml"))
+VEHICLE_MAKERS: dict[str, Maker] = {
     "car": cars.car,
     "truck": trucks.truck,
     "trailer": machines.trailer,
@@ -26,14 +26,13 @@ MAKERS: dict[str, Maker] = {
     "motorcycle": two_wheelers.motorcycle,
     "motorcyclist": two_wheelers.motorcyclist,
 }
-# Metres: smallest distance between two vehicles of one lane, bumper to bumper.
-BUMPER_GAP = 2.0
-LONGEST_ANGLED = 5.8  # longest vehicle that parks at an angle to the street, metres
+BUMPER_GAP = 2.0  # smallest distance between two vehicles in a lane, bumper to bumper, metres
+LONGEST_ANGLED = 5.8  # length of the longest vehicle that parks at an angle to the street, metres
 
 
 def choose_vehicle(rng: np.random.Generator, where: str) -> Maker:
-    """Return what draws a vehicle, chosen by the shares of a place in traffic.toml."""
-    return MAKERS[weighted_choice(rng, SHARES[where])]
+    """Draw a kind of vehicle and return its maker; `where` is a table of traffic.toml."""
+    return VEHICLE_MAKERS[weighted_choice(rng, VEHICLE_SHARES[where])]
 
 
 def length_of(mesh: Mesh) -> float:
@@ -94,14 +93,14 @@ def _fill_angled(site: Site, side: int, angle: float) -> None:
 
 
 def _is_bay(site: Site, x: float, half: float) -> bool:
-    """Return whether a vehicle of half a length has room in the parking lane at x."""
+    """Return whether a vehicle that is 2 * `half` metres long has room in the parking lane at x."""
     ground = site.ground
     has_room = ground.is_bay(x - half + 0.3) and ground.is_bay(x + half - 0.3)
     return has_room and ground.is_street(x, half + 2)
 
 
 def park_anywhere(site: Site, side: int) -> None:
-    """Park a few vehicles half on the sidewalk, on verges and at the edge of the road."""
+    """Park a few vehicles partly on the sidewalk, on verges and at the edge of the road."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -127,7 +126,7 @@ def park_anywhere(site: Site, side: int) -> None:
 
 
 def fill_side_roads(site: Site) -> None:
-    """Put waiting and parked vehicles on side roads, and lights or signs where they begin."""
+    """Put waiting and parked vehicles on side roads, and a light or a sign where each begins."""
     rng = site.rng
 
     for road in site.ground.plan.crossings:
@@ -160,9 +159,12 @@ def _put_on_side_road(site: Site, road: SideRoad, mesh: Mesh, along: float, acro
 
 
 def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
-    """Add vehicles to all lanes; all in one lane have one speed, so that none hits another.
+    """Add vehicles to all lanes. All vehicles in a lane have one speed, so that none hits another.
 
-    `ego` is x and t of the car with the sensor at time 0: nothing in its lane starts there.
+    Args:
+        site: the street.
+        ego_speed: speed of the car with the sensor, metres per second.
+        ego: x and t of the car with the sensor at time 0; no vehicle in its lane starts near it.
     """
     rng = site.rng
     ground = site.ground
@@ -194,7 +196,7 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
 
 
 def fill_bus_stops(site: Site) -> None:
-    """Put a stop with a shelter and people, and perhaps a bus, along some streets."""
+    """Put a bus stop with a shelter and people, and perhaps a bus, along some streets."""
     rng = site.rng
     ground = site.ground
     style = ground.style

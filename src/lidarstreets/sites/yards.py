@@ -1,4 +1,4 @@
-"""Fills plots with paved yards: car parks, petrol stations, garages and industrial yards."""
+"""Fill plots with paved yards: car parks, petrol stations, garages and industrial yards."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from lidarstreets.sites.traffic import choose_vehicle
 
 
 def fill_yard(plot: Plot) -> None:
-    """Pave a plot: a car park, a row of garages, a petrol station or an industrial yard."""
+    """Make a plot a car park, a row of garages, a petrol station or an industrial yard."""
     fillers = {_car_park: 0.58, _garage_row: 0.14, _petrol_station: 0.10, _industrial_yard: 0.18}
     weighted_choice(plot.rng, fillers)(plot)
 

@@ -1,1 +1,1 @@
-"""The ground of streets: kinds of streets, their plans, the relief, and the surface."""
+"""Draw the ground of streets: the kind of a street, its plan, its relief and its surface."""

@@ -1,4 +1,4 @@
-"""The ground of one street: its height, class and brightness at any position."""
+"""Compute the height, the class and the brightness of the ground of a street at any place."""
 
 import numpy as np
 
@@ -13,37 +13,35 @@ from lidarstreets.streets.plans import Patch, strip_at
 from lidarstreets.streets.relief import Relief
 from lidarstreets.streets.styles import Strip, Style, width_of
 
-# Metres: spacing of the two grids of the ground, and how far from the middle line they reach.
+# Spacing of the fine and the coarse grid of the ground, and their reach from the middle line of the
+# street, metres.
 FINE_STEP = 0.62
 FINE_REACH = 32.0
 COARSE_STEP = 4.0
 COARSE_REACH = 110.0
-# Metres by which the coarse grid is lower, so that the fine one covers it.
-COARSE_DROP = 0.3
-OVERHANG = 10.0  # metres by which the grids go on beyond the ends of the land
-KERB_RAMP = 0.03  # metres on either side of a kerb over which its height changes
-CROWN_SLOPE = 0.02  # rise over run from the edge of a road to its crown
-ISLAND_HEIGHT = 0.14  # metres: height of an island over the road
-HUMP_REACH = 1.8  # metres along the street from the top of a hump to its foot
-# Height of the kerb at a drive, as a share of its height elsewhere, and metres along the street
-# over which it changes.
-DRIVE_KERB = 0.2
-DRIVE_RAMP = 0.8
-SWERVE = 8.0  # metres: vehicles leave their lane this far before the ring of a roundabout
-RARELY_PARKED = 0.3  # of the places in a parking lane: below, few cars park in a street
+COARSE_DROP = 0.3  # depth of the coarse grid below the fine grid, which covers it, metres
+OVERHANG = 10.0  # reach of the grids beyond the ends of the land, metres
+KERB_RAMP = 0.03  # half the width over which the ground rises at a kerb, metres
+CROWN_SLOPE = 0.02  # slope from the edge of a road to its crown, rise over run
+ISLAND_HEIGHT = 0.14  # height of an island over the road, metres
+HUMP_REACH = 1.8  # half the length of a hump along the street, metres
+DRIVE_KERB = 0.2  # height of the kerb at a drive as a share of its height elsewhere
+DRIVE_RAMP = 0.8  # length along the street over which the kerb sinks to a drive, metres
+SWERVE = 8.0  # distance before the ring of a roundabout at which vehicles leave their lane, metres
+# Largest share of taken places in a parking lane that the benchmarks count as road.
+RARELY_PARKED_SHARE = 0.3
 
 
 class Ground(MiddleLine):
-    """Height and class of the ground of one street at any position.
+    """The ground of one street: its plan, and its height, class and brightness at any place.
 
-    The methods take and return arrays of one shape unless they say otherwise; lengths are in
-    metres.
+    Lengths are in metres. Unless a method says otherwise, it takes and returns arrays of one shape.
 
     Args:
         style: the numbers of the street.
-        length: of the land along x.
-        rng: draws the plan and the relief.
-        course: from and to, the x between which the sensor drives; all of the street if None.
+        length: length of the land along x.
+        rng: draws the plan, the relief and the brightness.
+        course: x where the sensor starts and ends; by default it drives along the whole street.
     """
 
     def __init__(
@@ -57,25 +55,28 @@ class Ground(MiddleLine):
         self.style = style
         self.length = length
         self.patches: list[Patch] = []
-        # Stretches (side, from, to) along the street that no plot may use.
+        # Stretches of the street that no plot may use: side, and x from and to.
         self.reserved: list[tuple[int, float, float]] = []
 
         self._relief = Relief(style, rng)
         self.plan = Planner(style, self, length, course or (0.0, length), rng).draw()
-        # Distance along the street from drive to drive, where the kerb is lowered, and their width.
+        # The kerb is lowered at drives: distance from drive to drive along the street, and width.
         self._drive_period = rng.uniform(9, 30)
         self._drive_width = rng.uniform(1.5, 4.0)
         self._brightness = GroundBrightness(rng)
 
     def lane_pose(self, x: float, t: float) -> tuple[float, float, float]:
-        """Return (x, y, yaw) of a vehicle in the lane at t, which goes round a roundabout."""
+        """Return (x, y, yaw) of a vehicle at x in the lane at t, which goes round a roundabout.
+
+        Takes and returns single numbers in metres and radians.
+        """
         step = 0.5
         swerve = self._swerve(x, t)
         px, py, yaw = self.pose_at(x, swerve)
         return px, py, yaw + float(np.arctan((self._swerve(x + step, t) - swerve) / step))
 
     def _swerve(self, x: float, t: float) -> float:
-        """Return t of a lane next to a roundabout."""
+        """Return t at x of the lane whose t is `t` away from roundabouts."""
         if self.plan.roundabout is None:
             return t
 
@@ -86,7 +87,10 @@ class Ground(MiddleLine):
         return float(t + weight * (side * roundabout.ring - t))
 
     def distance_from_crossings(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the distance from the nearest side road or roundabout; negative on it."""
+        """Return the distance of places x, y from the nearest side road or roundabout.
+
+        It is negative on the road.
+        """
         nearest = np.full(np.shape(x), np.inf)
         for crossing in self.plan.crossings:
             nearest = np.minimum(nearest, crossing.distance(x, y))
@@ -95,29 +99,29 @@ class Ground(MiddleLine):
         return nearest
 
     def is_street(self, x: float, margin: float = 0.0) -> bool:
-        """Return whether the street passes x, `margin` metres or more from its ends."""
+        """Return whether x is on the street, more than `margin` metres from its ends."""
         return self.plan.start + margin < x < self.plan.end - margin
 
     def front(self, side: int) -> float:
-        """Return |t| where the plots of one side (-1 right, 1 left) begin."""
+        """Return |t| where the plots of one side begin; side -1 is right, 1 is left."""
         return self.kerb_t(side) + width_of(self.style.strips[int(side > 0)])
 
     def kerb_t(self, side: int) -> float:
-        """Return |t| of the kerb of one side, away from side roads."""
+        """Return |t| of the kerb of one side away from side roads; side -1 is right, 1 is left."""
         return self.style.road / 2 + self.style.parking[int(side > 0)]
 
     def is_bay(self, x: float) -> bool:
-        """Return whether the parking lanes are not interrupted by an island at x."""
+        """Return whether no island interrupts the parking lanes at x."""
         return bool(is_bay(np.array([x]), self.style.parking_period)[0])
 
     def height(self, x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
-        """Return the height of the ground at positions x, y."""
+        """Return the height of the ground at the places x, y."""
         x = np.asarray(x, dtype=float)
         y = np.asarray(y, dtype=float)
         return self._height(x, y, locate(self, self.plan, x, y))
 
     def _height(self, x: np.ndarray, y: np.ndarray, places: Places) -> np.ndarray:
-        """Return the height at positions x, y, which lie at `places` in the street."""
+        """Return the height of the ground at x, y; `places` says where these lie in the street."""
         style = self.style
         z = self._relief.hills(x, y)
 
@@ -145,14 +149,14 @@ class Ground(MiddleLine):
                 edge += strip.width
             z = z + np.where(is_here, kerb * rise, 0)
 
-        # Along side roads, the land begins as far from the kerb as along the street.
+        # The land begins as far from the kerb along side roads as along the street.
         right = width_of(style.strips[0])
         left = width_of(style.strips[1])
         pavement = right + (left - right) * np.clip(0.5 + places.t / 4, 0, 1)
         return z + self._relief.beyond(places.kerb - pavement, places.t, places.x, x, y)
 
     def _profiles(self, places: Places) -> list[tuple[tuple[Strip, ...], np.ndarray]]:
-        """Return the strips of each road, and whether it is the nearest one of each place."""
+        """Return the strips along each road, and which places are nearest to this road."""
         is_street = places.branch < 0
         profiles = [
             (self.style.strips[0], is_street & (places.t < 0)),
@@ -163,10 +167,10 @@ class Ground(MiddleLine):
         return profiles
 
     def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the class ids of the ground at positions x, y, (N,) each: (N,) uint16."""
+        """Return the class ids of the ground at the (N,) places x, y: (N,) uint16."""
         places = locate(self, self.plan, x, y)
 
-        # From the plots to the road: each step may overwrite those before it.
+        # Classify from the plots to the road: each step may overwrite earlier steps.
         label = np.full(np.shape(x), Label.TERRAIN, dtype=np.uint16)
         off = np.zeros(np.shape(x))
         for strips, is_here in self._profiles(places):
@@ -182,9 +186,9 @@ class Ground(MiddleLine):
             inside &= (plot_t > patch.t[0]) & (plot_t < patch.t[1])
             label[plots[inside]] = patch.label
 
-        # Where few cars park, the benchmarks call the lane at the kerb road.
+        # Where few cars park, the benchmarks label the lane at the kerb as road.
         right, left = self.style.is_bus_bay
-        is_used = ~np.where(places.t < 0, right, left) & (self.style.parked > RARELY_PARKED)
+        is_used = ~np.where(places.t < 0, right, left) & (self.style.parked > RARELY_PARKED_SHARE)
         at_kerb = (places.kerb < 0) & (places.road >= 0)
         label[at_kerb] = np.where(is_used[at_kerb], Label.PARKING, Label.ROAD)
         on_road = places.road < 0
@@ -200,7 +204,7 @@ class Ground(MiddleLine):
         return label
 
     def tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
-        """Return the tint of the ground, as in `Mesh`; it varies from place to place."""
+        """Return the tints of the ground at the (N,) places x, y, as in `Mesh`: (N,)."""
         tint = self._brightness.terrain_tint(x, y, label)
         is_paved = (label != Label.TERRAIN) & (label != Label.VEGETATION)
         along, t = self.street_coordinates(x[is_paved], y[is_paved])
@@ -208,13 +212,16 @@ class Ground(MiddleLine):
         return tint
 
     def mesh(self) -> Mesh:
-        """Return the ground as triangles of class 0: a fine grid over a coarse one."""
+        """Return the ground as triangles of class 0: a fine grid over a coarse grid."""
         fine = self._grid(FINE_STEP, FINE_REACH, 0.0)
         coarse = self._grid(COARSE_STEP, COARSE_REACH, COARSE_DROP)
         return part([fine, coarse], Surface.GRASS, 0)
 
     def _grid(self, step: float, reach: float, drop: float) -> np.ndarray:
-        """Return the (T, 3, 3) triangles of a square grid up to `reach` from the middle line."""
+        """Return the (T, 3, 3) triangles of a square grid, `drop` metres below the ground.
+
+        It has the spacing `step` and reaches `reach` metres from the middle line.
+        """
         xs = np.arange(-OVERHANG, self.length + OVERHANG, step)
         lowest_y = self.middle(xs).min() - reach
         highest_y = self.middle(xs).max() + reach
@@ -234,7 +241,7 @@ class Ground(MiddleLine):
         return quads(a, b, c, d)
 
     def _sharpen(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, places: Places) -> None:
-        """Move the corners next to a kerb to its two edges, so that it is steep."""
+        """Move the corners next to a kerb to the two edges of the kerb, so that it is steep."""
         edge = np.where(np.abs(places.kerb) < np.abs(places.island), places.kerb, places.island)
         slope_x = np.zeros_like(edge)
         slope_y = np.zeros_like(edge)
@@ -251,5 +258,5 @@ class Ground(MiddleLine):
 
 
 def _ramp(distance: np.ndarray) -> np.ndarray:
-    """Return 0 on the road, 1 behind the kerb, and a steep line over the kerb itself."""
+    """Return 0 on the road, 1 behind the kerb, and a steep ramp over the kerb itself."""
     return np.clip((distance + KERB_RAMP) / (2 * KERB_RAMP), 0, 1)

@@ -1,4 +1,4 @@
-"""The kinds of streets and the typical numbers of each."""
+"""Define the kinds of streets; kinds.toml has the typical numbers of each."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +8,9 @@ from lidarstreets.tables import read_table
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The numbers of what lies along a street and moves in it; lengths are in metres."""
+    """What lies along a street and moves in it, in numbers. Lengths are in metres."""
 
-    # Chances that a plot has a house, a row of houses, a wood, an open field, a car park.
+    # Chances that a plot has a house, a row of houses, a wood, open land or a paved yard.
     plots: tuple[float, float, float, float, float]
     # Smallest and largest distance of a house from the front of its plot.
     setback: tuple[float, float]
@@ -20,17 +20,17 @@ class Surroundings:
     parked: float
     # Distance between trees along the street; infinite if there are none.
     trees: float
-    # Chance of a hedge, wall or fence along the front of a plot.
+    # Factor on the chances of hedges, walls and fences around a plot.
     fenced: float
-    # Driving cars per 100 m of lane.
+    # Mean number of driving vehicles per 90 m of the free length of a lane.
     traffic: float
     # Factor on the speed of the traffic and of the sensor.
     speed: float
-    # People and cyclists per 100 m of street.
+    # Mean number of people and cyclists per 100 m of street.
     people: float
     # Factor on the number of plants in gardens.
     green: float
-    # Side roads per 100 m.
+    # Density of junctions: on average, there is one every 92 / `junctions` metres.
     junctions: float
 
 
@@ -38,20 +38,21 @@ class Surroundings:
 class Kind(Surroundings):
     """The typical numbers of one kind of street; `draw_style` varies them for each street."""
 
-    # Share of all streets.
+    # Share of this kind in all streets.
     share: float
-    # Smallest and largest width of a lane, and chances of 1, 2, 3 lanes in each direction.
+    # Smallest and largest width of a lane.
     lane: tuple[float, float]
+    # Chances of 1, 2 and 3 lanes in each direction.
     lanes: tuple[float, float, float]
-    # Chances of a long median and of islands in the middle of the road.
+    # Chance of one long island in the middle of the road.
     median: float
+    # Chance of short islands in the middle of the road.
     islands: float
     # Chance of a parking lane on each side.
     parking: float
-    # Chance of a bus bay or a lane for turning on a side without parking lane.
+    # Chance of a bus bay or a turning lane on a side without a parking lane.
     bus_bays: float
-    # Chances of the arrangements of strips on each side; their names are those in
-    # `_draw_strips` of `styles`.
+    # Chances of the arrangements of strips on each side, which `_draw_strips` in styles.py names.
     sides: dict[str, float]
     # Largest height of the banks.
     relief: float
@@ -62,4 +63,4 @@ class Kind(Surroundings):
 
 
 _TABLE = read_table(Path(__file__).with_suffix(".toml"))
-KINDS = {name: Kind(**row) for name, row in _TABLE.items()}
+STREET_KINDS = {name: Kind(**row) for name, row in _TABLE.items()}

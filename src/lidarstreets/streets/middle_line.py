@@ -1,37 +1,37 @@
-"""The middle line of a street, and the coordinates along and across it."""
+"""Define the middle line of a street, and the coordinates along and across it."""
 
 import numpy as np
 
 from lidarstreets.streets.styles import Style
 
-# Metres: smallest radius of a bend, and of one in a street whose speed factor is above `FAST`.
-TIGHTEST_BEND = 35.0
-TIGHTEST_FAST_BEND = 300.0
-FAST = 1.7
+TIGHTEST_BEND = 35.0  # smallest radius of a bend, metres
+TIGHTEST_FAST_BEND = 300.0  # smallest radius of a bend in a fast street, metres
+FAST_STREET = 1.7  # speed factor, `Style.speed`, above which a street is fast
 
 
 class MiddleLine:
-    """The middle line of a street: y = f(x), a sum of waves.
+    """The middle line of a street: y = f(x), a sum of W waves.
 
-    Street coordinates are x of the nearest point of the line and t, the signed distance from it in
-    metres, which is positive to the left of the direction of travel, +x.
+    The street coordinates of a place are x and t, both in metres. x is the x of the nearest point
+    of the line. t is the signed distance from that point: it is positive on the left, seen in the
+    direction of travel, +x.
 
     Args:
-        bends: (W, 3) amplitude, wavelength and phase of each wave; metres, metres, radians.
+        bends: (W, 3) amplitude in metres, wavelength in metres and phase in radians of each wave.
     """
 
     def __init__(self, bends: np.ndarray) -> None:
         self._bends = bends
 
     def middle(self, x: np.ndarray | float) -> np.ndarray:
-        """Return y of the middle line of the street."""
+        """Return y of the middle line at x, metres, in the shape of x."""
         y = np.zeros(np.shape(x))
         for amplitude, wavelength, phase in self._bends:
             y = y + amplitude * np.sin(2 * np.pi / wavelength * np.asarray(x) + phase)
         return y
 
     def yaw(self, x: np.ndarray | float) -> np.ndarray:
-        """Return the direction of the street in radians."""
+        """Return the direction of the middle line at x, radians, in the shape of x."""
         slope = np.zeros(np.shape(x))
         for amplitude, wavelength, phase in self._bends:
             wave = np.cos(2 * np.pi / wavelength * np.asarray(x) + phase)
@@ -39,13 +39,13 @@ class MiddleLine:
         return np.arctan(slope)
 
     def pose_at(self, x: float, t: float) -> tuple[float, float, float]:
-        """Return (x, y, yaw) at street coordinates; takes and returns single numbers."""
+        """Return (x, y, yaw) of the street at street coordinates x, t, in metres and radians."""
         yaw = float(self.yaw(x))
         return x - t * np.sin(yaw), float(self.middle(x)) + t * np.cos(yaw), yaw
 
     def street_coordinates(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the street coordinates of positions x, y."""
-        # Steps towards the foot of the perpendicular on the middle line.
+        """Return the street coordinates (x, t) of the places x, y; all arrays have one shape."""
+        # Step twice towards the foot of the perpendicular on the middle line.
         foot = x
         for _ in range(2):
             yaw = self.yaw(foot)
@@ -57,12 +57,12 @@ class MiddleLine:
 
 
 def draw_bends(style: Style, rng: np.random.Generator) -> np.ndarray:
-    """Draw (2, 3) amplitude, wavelength and phase of the two waves of a middle line."""
+    """Draw the two waves of a middle line: (2, 3), as `MiddleLine` takes them."""
     steepness = 0.0 if rng.random() < 0.25 else rng.uniform(0.05, 0.35)
     wavelengths = rng.uniform(180, 500, size=2)
     if style.kind in ("residential", "living", "rural") and rng.random() < 0.4:
         wavelengths[1] = rng.uniform(80, 180)
-    largest_curvature = 1 / (TIGHTEST_FAST_BEND if style.speed > FAST else TIGHTEST_BEND)
+    largest_curvature = 1 / (TIGHTEST_FAST_BEND if style.speed > FAST_STREET else TIGHTEST_BEND)
 
     amplitudes = steepness * rng.uniform(0.4, 1.0, size=2) * wavelengths / (2 * np.pi)
     largest = 0.5 * largest_curvature * (wavelengths / (2 * np.pi)) ** 2

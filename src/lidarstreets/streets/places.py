@@ -1,4 +1,4 @@
-"""Where positions lie in a street: their distances from its roads, kerbs and islands."""
+"""Compute where places lie in a street: their distances from its roads, kerbs and islands."""
 
 from dataclasses import dataclass
 
@@ -7,24 +7,23 @@ import numpy as np
 from lidarstreets.streets.middle_line import MiddleLine
 from lidarstreets.streets.plans import Plan, rounded_union
 
-# Metres: the parking lane ends this far from a side road, over the second distance.
-PARKING_END = 5.0
-PARKING_TAPER = 1.5
-BAY_GAP = 2.0  # metres: length of an island between two parking bays
-ROUNDABOUT_CORNER = 6.0  # metres: radius of the kerb between a street and its roundabout
+PARKING_END = 5.0  # distance from a side road at which the parking lane ends, metres
+PARKING_TAPER = 1.5  # length over which the parking lane widens from its end, metres
+BAY_GAP = 2.0  # length of an island between two parking bays, metres
+ROUNDABOUT_CORNER = 6.0  # radius of the kerb between a street and its roundabout, metres
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where positions lie in a street; all arrays have one shape, distances are in metres.
+    """Where places lie in a street. All arrays have one shape; distances are in metres.
 
     Attributes:
         x, t: street coordinates.
-        road: distance from the edge of the nearest carriageway; negative on it.
-        crossing: distance from the edge of the nearest side road; negative on it.
-        branch: index of that side road; -1 if the street itself is nearer.
-        kerb: distance from the kerb; negative on the side of the road.
-        island: distance from the edge of the nearest island; negative on it.
+        road: distance from the edge of the nearest carriageway; negative on the carriageway.
+        crossing: distance from the edge of the nearest side road or roundabout; negative on it.
+        branch: index of the nearest side road; -1 if the street itself is nearer.
+        kerb: distance from the kerb; negative on the road.
+        island: distance from the edge of the nearest island; negative on the island.
     """
 
     x: np.ndarray
@@ -37,7 +36,7 @@ class Places:
 
 
 def locate(line: MiddleLine, plan: Plan, x: np.ndarray, y: np.ndarray) -> Places:
-    """Return where positions x, y, arrays of one shape, lie in a street."""
+    """Return where the places x, y in metres, arrays of one shape, lie in a street."""
     style = plan.style
     along, t = line.street_coordinates(x, y)
     ends = np.maximum(plan.start - along, along - plan.end)
@@ -53,7 +52,7 @@ def locate(line: MiddleLine, plan: Plan, x: np.ndarray, y: np.ndarray) -> Places
         branch = np.where(distance < crossing, index, branch)
         crossing = np.minimum(crossing, distance)
 
-    # The parking lane ends short of a side road, and where islands interrupt it.
+    # The parking lane ends before a side road, and where an island interrupts it.
     parking = np.where(t < 0, style.parking[0], style.parking[1])
     kerb = road
     if parking.any():
@@ -80,7 +79,12 @@ def locate(line: MiddleLine, plan: Plan, x: np.ndarray, y: np.ndarray) -> Places
 
 
 def is_bay(along: np.ndarray, period: float) -> np.ndarray:
-    """Return whether no island interrupts the parking lanes at x; there is one each `period`."""
+    """Return where no island interrupts the parking lanes, in the shape of `along`.
+
+    Args:
+        along: x along the street, metres.
+        period: distance from island to island, metres; infinite if there are none.
+    """
     if not np.isfinite(period):
         return np.ones(np.shape(along), dtype=bool)
 

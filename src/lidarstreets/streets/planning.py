@@ -1,4 +1,4 @@
-"""Draws the plans of streets: where they end, their junctions, islands, humps and crosswalks."""
+"""Draw the plans of streets: where they end, their junctions, islands, humps and crosswalks."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,10 +11,9 @@ from lidarstreets.streets.middle_line import MiddleLine
 from lidarstreets.streets.plans import Island, Plan, Roundabout, SideRoad
 from lidarstreets.streets.styles import Strip, Style
 
-# Metres: the islands of the middle reach this far beyond the simulated land.
-OVERHANG = 50.0
-TIGHTEST_SIDE_ROAD = 45.0  # metres: radius of the tightest bend of a side road
-WIDE_SIDE_ROADS = 0.25  # share of the side roads that are as wide as a main road
+OVERHANG = 50.0  # reach of the islands in the middle beyond the simulated land, metres
+TIGHTEST_SIDE_ROAD = 45.0  # smallest radius of the bend of a side road, metres
+WIDE_SIDE_ROAD_SHARE = 0.25  # share of the side roads that are as wide as a main road
 
 
 @dataclass(frozen=True)
@@ -23,10 +22,10 @@ class Planner:
 
     Attributes:
         style: the numbers of the street.
-        line: its middle line.
-        length: metres along x.
-        course: from and to, the x between which the sensor drives.
-        rng: draws everything.
+        line: the middle line of the street.
+        length: length of the land along x, metres.
+        course: x where the sensor starts and ends, metres.
+        rng: draws everything in the plan.
     """
 
     style: Style
@@ -36,7 +35,7 @@ class Planner:
     rng: np.random.Generator
 
     def draw(self) -> Plan:
-        """Draw the plan."""
+        """Draw the plan of the street."""
         start, end = self._draw_ends()
         roundabout = self._draw_roundabout(start, end)
         crossings = self._draw_crossings(start, end, roundabout)
@@ -56,7 +55,7 @@ class Planner:
         )
 
     def _draw_ends(self) -> tuple[float, float]:
-        """Draw where the street begins and ends; most streets do so out of sight."""
+        """Draw x where the street begins and ends; most streets begin and end out of sight."""
         rng = self.rng
         start = -np.inf
         end = np.inf
@@ -104,7 +103,7 @@ class Planner:
             for side in (-1, 1):
                 if rng.random() < 0.8:
                     crossings.append(self._draw_side_road(roundabout.x, side))
-        # A street that ends may end at a road across.
+        # A street that ends may end at a road that crosses it.
         if np.isfinite(end) and rng.random() < 0.6:
             for side in (-1, 1):
                 crossings.append(self._draw_side_road(end - 3.0, side))
@@ -116,7 +115,7 @@ class Planner:
         is_drive = rng.random() < 0.2
         width = rng.uniform(2.6, 4.0) if is_drive else rng.uniform(4.5, 9.0)
         corner = rng.uniform(1, 3) if is_drive else rng.uniform(2, 12)
-        is_wide = not is_drive and rng.random() < WIDE_SIDE_ROADS
+        is_wide = not is_drive and rng.random() < WIDE_SIDE_ROAD_SHARE
         if is_wide:
             width = rng.uniform(9.0, 18.0)
             corner = rng.uniform(6, 18)
@@ -139,7 +138,7 @@ class Planner:
         )
 
     def _draw_side_strips(self) -> tuple[Strip, ...]:
-        """Draw what lies along a side road: mostly the same as along the street."""
+        """Draw the strips along a side road; most side roads have the strips of the street."""
         rng = self.rng
         if rng.random() < 0.6:
             strips = self.style.strips[int(rng.integers(2))]
@@ -206,7 +205,7 @@ class Planner:
         return islands
 
     def _draw_humps(self) -> np.ndarray:
-        """Draw (H, 2) humps of the road: x along the street, and height in metres."""
+        """Draw the H humps of the road: (H, 2) x along the street and height, metres."""
         rng = self.rng
         if self.style.kind not in ("living", "residential") or rng.random() > 0.25:
             return np.zeros((0, 2))
@@ -215,7 +214,7 @@ class Planner:
         return np.column_stack([x, np.full(len(x), rng.uniform(0.04, 0.12))])
 
     def _draw_crosswalks(self, crossings: list[SideRoad]) -> list[tuple[float, float]]:
-        """Draw the zebra crossings next to side roads: (from, to) along the street."""
+        """Draw the zebra crossings next to side roads: x from and to along the street, metres."""
         rng = self.rng
         if self.style.kind in ("motorway", "fast") or not self.style.painted:
             return []

@@ -1,4 +1,4 @@
-"""The plan of a street: side roads, roundabouts and islands, each as a distance from its edge."""
+"""Define the plan of a street: side roads, roundabouts and islands as distances from an edge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from lidarstreets.materials import Label
 from lidarstreets.streets.styles import Strip, Style, width_of
 
-# A bent side road goes on straight once its direction has changed by about this tangent.
+# Tangent of the change of direction after which a bent side road continues straight.
 LARGEST_TURN = 0.9
 
 
@@ -18,15 +18,15 @@ class SideRoad:
 
     Attributes:
         x, y: where its middle line meets the middle line of the street, metres.
-        street_x: the same place along the street.
+        street_x: x of this place along the street, metres.
         yaw: its direction there, away from the street, radians.
-        side: the side on which it leaves the street, -1 right and 1 left.
-        width: metres.
+        side: the side on which it leaves the street: -1 is right, 1 is left.
+        width: width of the carriageway, metres.
         bend: curvature in 1 / metres, positive to the left.
-        length: metres from the middle line of the street to its end; may be infinite.
-        turning: radius of the circle at its end; 0 if there is none.
+        length: distance of its end from the middle line of the street, metres; may be infinite.
+        turning: radius of the turning circle at its end, metres; 0 if there is none.
         corner: radius of the kerb at the junction, metres.
-        strips: what lies along both of its kerbs.
+        strips: what lies along each of its kerbs, from the kerb outwards.
     """
 
     x: float
@@ -42,7 +42,11 @@ class SideRoad:
     strips: tuple[Strip, ...] = ()
 
     def coordinates(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distances along the road and to the left of its middle line."""
+        """Return the coordinates of places x, y on the road; all arrays have one shape.
+
+        Returns:
+            Distances along the middle line of the road, and to the left of it, metres.
+        """
         cos = np.cos(self.yaw)
         sin = np.sin(self.yaw)
         along = (x - self.x) * cos + (y - self.y) * sin
@@ -56,7 +60,7 @@ class SideRoad:
         return along, across
 
     def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the distance from the edge of the road; negative on it."""
+        """Return the distance of places x, y from the edge of the road; negative on the road."""
         along, across = self.coordinates(x, y)
         distance = np.maximum(np.abs(across) - self.width / 2, -along)
         if np.isfinite(self.length):
@@ -67,7 +71,10 @@ class SideRoad:
         return distance
 
     def pose_at(self, along: float, across: float) -> tuple[float, float, float]:
-        """Return (x, y, yaw) of a place on the road; yaw is away from the street."""
+        """Return (x, y, yaw) at coordinates of the road, in metres and radians.
+
+        The yaw is the direction of the road away from the street.
+        """
         bent = min(along, LARGEST_TURN / abs(self.bend)) if self.bend else along
         tangent = self.bend * bent
         middle = 0.5 * tangent * bent + tangent * (along - bent)
@@ -86,9 +93,9 @@ class Roundabout:
 
     Attributes:
         x, y: its centre, metres.
-        street_x: the same place along the street.
-        radius: outer radius of the ring.
-        island: radius of the island in its middle.
+        street_x: x of its centre along the street, metres.
+        radius: outer radius of the ring, metres.
+        island: radius of the island in its middle, metres.
         label: class of the island.
     """
 
@@ -101,15 +108,15 @@ class Roundabout:
 
     @property
     def ring(self) -> float:
-        """Radius on which vehicles drive."""
+        """Radius of the circle on which vehicles drive, metres."""
         return (self.radius + self.island) / 2
 
     def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the distance from the outer edge of the ring; negative within it."""
+        """Return the distance of places x, y from the outer edge of the ring; negative inside."""
         return np.hypot(x - self.x, y - self.y) - self.radius
 
     def island_distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the distance from the edge of the island; negative on it."""
+        """Return the distance of places x, y from the edge of the island; negative on it."""
         return np.hypot(x - self.x, y - self.y) - self.island
 
 
@@ -118,8 +125,8 @@ class Patch:
     """A rectangle of other ground, in street coordinates.
 
     Attributes:
-        x: from and to, along the street.
-        t: from and to, across the street.
+        x: from and to, along the street, metres.
+        t: from and to, across the street, metres.
         label: class of the ground.
     """
 
@@ -132,7 +139,7 @@ class Island(Patch):
     """A patch on the road that is raised and has round ends."""
 
     def distance(self, along: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return the distance from its edge; negative on it."""
+        """Return the distance of street coordinates from its edge, metres; negative on it."""
         radius = min(self.x[1] - self.x[0], self.t[1] - self.t[0]) / 2
         half_x = (self.x[1] - self.x[0]) / 2 - radius
         half_t = (self.t[1] - self.t[0]) / 2 - radius
@@ -148,11 +155,11 @@ class Plan:
 
     Attributes:
         style: the numbers of the street.
-        start, end: x where the street begins and ends; infinite if it does so out of sight.
-        roundabout: None if there is none.
+        start, end: x where the street begins and ends; infinite if that is out of sight.
+        roundabout: the roundabout, or None if there is none.
         crossings: the side roads.
-        islands: in the middle of the road.
-        humps: (H, 2) x and height of the humps of the road.
+        islands: the islands in the middle of the road.
+        humps: (H, 2) x along the street and height of the humps of the road.
         crosswalks: x from and to of each zebra crossing.
     """
 
@@ -167,9 +174,11 @@ class Plan:
 
 
 def rounded_union(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
-    """Return the distance from the union of two areas whose inner corners have a radius.
+    """Return the distance from the union of two areas, whose inner corners are rounded.
 
-    The distances from the edges of the two areas are negative on them.
+    Args:
+        a, b: distances from the edges of the two areas, negative inside; arrays of one shape.
+        radius: radius of the corners, in the unit of the distances.
     """
     inside_a = np.maximum(radius - a, 0)
     inside_b = np.maximum(radius - b, 0)
@@ -182,9 +191,16 @@ def rounded_union(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
 def strip_at(
     strips: Sequence[Strip], kerb: np.ndarray, beyond: Label
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (N,) classes and distances beyond the last strip at (N,) distances from the kerb.
+    """Return the class of the ground at N distances from a kerb.
 
-    The strips are from the kerb outwards, with ground of the class `beyond` behind them.
+    Args:
+        strips: the strips along the kerb, from the kerb outwards.
+        kerb: (N,) distances from the kerb, metres.
+        beyond: class of the ground behind the last strip.
+
+    Returns:
+        (N,) uint16 class ids; and (N,) distances from the outer edge of the last strip in metres,
+        which are negative on the strips.
     """
     label = np.full(np.shape(kerb), beyond, dtype=np.uint16)
     outer = width_of(strips)

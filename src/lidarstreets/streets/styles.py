@@ -1,4 +1,4 @@
-"""The numbers that describe one street, and how they are drawn for a street of a kind."""
+"""Draw the numbers that describe one street."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label
-from lidarstreets.streets.kinds import KINDS, Kind, Surroundings
+from lidarstreets.streets.kinds import STREET_KINDS, Kind, Surroundings
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Strip:
     """A strip of ground along a road.
 
     Attributes:
-        width: metres.
+        width: width, metres.
         label: class of the ground.
         raised: True if it is as high as the kerb, False if it is level with the road.
     """
@@ -26,7 +26,7 @@ class Strip:
 
 
 def width_of(strips: Sequence[Strip]) -> float:
-    """Return the width of strips that lie next to each other."""
+    """Return the total width of strips, metres."""
     return sum(strip.width for strip in strips)
 
 
@@ -35,7 +35,7 @@ class Bank:
     """The shape of the land on one side of a street; lengths are in metres.
 
     Attributes:
-        slope: rise over run, from the pavement outwards.
+        slope: slope from the pavement outwards, rise over run.
         start: distance from the pavement at which the bank begins.
         width: distance over which it rises.
         rise: height of its top over its foot; negative if the land falls.
@@ -53,48 +53,49 @@ class Bank:
 class Style(Surroundings):
     """The numbers that describe one street.
 
-    Lengths are in metres. Pairs with one entry per side of the road are (right, left).
+    Lengths are in metres. Pairs with one entry for each side of the road are (right, left).
     """
 
-    # A key of `KINDS`.
+    # Kind of street, a key of `STREET_KINDS`.
     kind: str
-    # Width of the carriageway, the middle included.
+    # Width of the carriageway, with the median.
     road: float
-    # Width in the middle of the road that no lane uses; 0 if there is none.
+    # Width of the median, the middle of the road that no lane uses; 0 if there is none.
     median: float
-    # Class of the islands in the middle of the road, and whether they form one long island.
+    # Class of the islands in the middle of the road.
     median_label: Label
+    # Whether these islands form one long island.
     has_long_median: bool
-    # (t, direction) of each lane: its place across the street, and 1 along +x or -1 against it.
+    # t across the street of each lane, and its direction: 1 along +x, -1 against it.
     lanes: tuple[tuple[float, int], ...]
-    # Width of the lane for parking on each side; 0 if there is none. Nobody parks on it if it is a
-    # bus bay or a lane for turning.
+    # Width of the parking lane on each side; 0 if there is none.
     parking: tuple[float, float]
+    # Whether the parking lane is a bus bay or a turning lane, where nobody parks.
     is_bus_bay: tuple[bool, bool]
     # Angle in radians between parked cars and the street on each side.
     parking_angle: tuple[float, float]
-    # Distance between the islands that interrupt the lanes for parking; infinite if there are none.
+    # Distance between the islands that interrupt the parking lanes; infinite if there are none.
     parking_period: float
-    # What lies between the kerb and the plots on each side, from the road outwards.
+    # Strips between the kerb and the plots on each side, from the road outwards.
     strips: tuple[tuple[Strip, ...], tuple[Strip, ...]]
     # Height of the kerb.
     kerb: float
-    # The land on each side.
+    # Shape of the land on each side.
     bank: tuple[Bank, Bank]
     # Distance between lamps or utility poles.
     lamps: float
-    # True if lane markings are painted.
+    # Whether lane markings are painted.
     painted: bool
 
 
 def draw_style(rng: np.random.Generator) -> Style:
-    """Draw a street of a random kind and vary the numbers of that kind."""
-    shares = {name: kind.share for name, kind in KINDS.items()}
+    """Draw a kind of street, and vary its typical numbers."""
+    shares = {name: kind.share for name, kind in STREET_KINDS.items()}
     name = weighted_choice(rng, shares)
-    kind = KINDS[name]
+    kind = STREET_KINDS[name]
 
-    # The chances vary around the kind's; a larger factor than 8 would make them vary less.
-    # A Dirichlet distribution does not allow 0, hence the small number.
+    # The chances vary around the chances of the kind. A factor above 8 would make them vary less.
+    # The small number is there because a Dirichlet distribution does not allow 0.
     house, row, wood, field, lot = rng.dirichlet(np.array(kind.plots) * 8 + 1e-3).tolist()
 
     middle = rng.random()
@@ -136,7 +137,7 @@ def draw_style(rng: np.random.Generator) -> Style:
 
 
 def _draw_median(rng: np.random.Generator, is_long: bool, has_islands: bool) -> float:
-    """Draw the width in the middle of the road that no lane uses."""
+    """Draw the width of the median, metres; 0 if there is none."""
     if is_long:
         return float(rng.uniform(1.2, 5.0) if rng.random() < 0.8 else rng.uniform(5.0, 12.0))
     if has_islands:
@@ -155,7 +156,7 @@ def _draw_median_label(rng: np.random.Generator, is_long: bool) -> Label:
 def _draw_lanes(
     rng: np.random.Generator, kind: Kind, median: float
 ) -> tuple[tuple[tuple[float, int], ...], float]:
-    """Draw the lanes of a street; return them and the width of the carriageway."""
+    """Draw the lanes of a street as in `Style`, and the width of the carriageway in metres."""
     width = rng.uniform(*kind.lane)
     count = 1 + int(rng.choice(3, p=kind.lanes))
     margin = rng.uniform(0.0, 0.6)
@@ -174,10 +175,7 @@ def _draw_lanes(
 def _draw_parking(
     rng: np.random.Generator, kind: Kind
 ) -> tuple[tuple[float, float], tuple[float, float], tuple[bool, bool]]:
-    """Draw the lanes for parking, (right, left) each.
-
-    Return their widths, the angles of the cars on them, and whether nobody parks on them.
-    """
+    """Draw `parking`, `parking_angle` and `is_bus_bay` of a `Style`."""
     widths = []
     angles = []
     bays = []
@@ -199,7 +197,7 @@ def _draw_parking(
 
 
 def _draw_strips(rng: np.random.Generator, sides: dict[str, float]) -> tuple[Strip, ...]:
-    """Draw what lies between the kerb and the plots on one side, from the road outwards."""
+    """Draw the strips between the kerb and the plots on one side, from the road outwards."""
     name = weighted_choice(rng, sides)
     walk = float(rng.uniform(1.4, 3.2) if rng.random() < 0.55 else rng.uniform(3.2, 6.0))
     verge = float(rng.uniform(0.5, 2.6))

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarstreets import SENSORS, SimulatedScan, drive_street
+from lidarstreets import LIDAR_MODELS, SimulatedScan, drive_street
 from lidarstreets.bodies import buildings, clutter, fences, furniture, plants, trees
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Maker, Mesh, join, place
 from lidarstreets.sensing.lidar import Hits, RayScene, trace
 from lidarstreets.sensing.returns import draw_lasers, receive
 
-HDL64E = SENSORS["hdl64e"]
+HDL64E = LIDAR_MODELS["hdl64e"]
 
 WITHOUT_CLASS = {Label.OTHER_OBJECT, Label.OTHER_STRUCTURE}
 POLE_AND_SIGN = {Label.POLE, Label.TRAFFIC_SIGN, Label.OTHER_OBJECT, Label.OTHER_STRUCTURE}
@@ -79,7 +79,7 @@ def test_a_body_is_finite_stands_on_the_ground_and_has_labels_of_its_kind(name: 
         assert (mesh.depth >= 0).all()
 
 
-@pytest.mark.parametrize("kind", fences.KINDS)
+@pytest.mark.parametrize("kind", fences.FENCE_KINDS)
 def test_a_fence_is_as_long_and_high_as_it_says(kind: str) -> None:
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -95,7 +95,7 @@ def test_a_fence_is_as_long_and_high_as_it_says(kind: str) -> None:
 
 def test_an_overgrown_fence_has_leaves_and_those_within_it_are_fence() -> None:
     rng = np.random.default_rng(0)
-    fence = replace(fences.draw_fence(rng, fences.SHARES["garden"]), overgrown=1.0)
+    fence = replace(fences.draw_fence(rng, fences.FENCE_SHARES["garden"]), overgrown=1.0)
     along = 0
     for _ in range(30):
         mesh = fence.segment(rng, 2.5)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarstreets import SENSORS
+from lidarstreets import LIDAR_MODELS
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place, with_random_tint
 from lidarstreets.sensing.sensors import LidarModel
@@ -18,7 +18,7 @@ from lidarstreets.sensing import lidar
 from lidarstreets.sensing.lidar import RayScene, trace
 from lidarstreets.sensing.returns import draw_lasers, receive
 
-HDL64E = SENSORS["hdl64e"]
+HDL64E = LIDAR_MODELS["hdl64e"]
 # A sensor without noise, losses or motion; the tests turn on what they need.
 EXACT = replace(
     HDL64E,
@@ -197,8 +197,8 @@ def test_some_returns_at_edges_lie_in_between(mixed: float, smallest: int, large
 @pytest.fixture
 def without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make all foliage equally dense, so that each pulse ends by chance of its own."""
-    monkeypatch.setattr(lidar, "OPENNESS", (1.0, 0.0))
-    monkeypatch.setattr(lidar, "CLUMP", (0.2, 0.0))
+    monkeypatch.setattr(lidar, "GAP_OPENNESS", (1.0, 0.0))
+    monkeypatch.setattr(lidar, "CLUMP_PATCH", (0.2, 0.0))
 
 
 @pytest.mark.usefixtures("without_gaps")

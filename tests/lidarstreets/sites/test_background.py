@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarstreets.bodies.fences import SHARES, draw_fence
+from lidarstreets.bodies.fences import FENCE_SHARES, draw_fence
 from lidarstreets.materials import Label
 from lidarstreets.sites import background
 from lidarstreets.sites.background import line_side_road
@@ -19,8 +19,8 @@ HIGH = 1.8
 
 
 def low_wall_and_fence(rng: np.random.Generator) -> Boundary:
-    wall = replace(draw_fence(rng, SHARES["low"]), height=LOW)
-    fence = replace(draw_fence(rng, SHARES["garden"]), height=HIGH)
+    wall = replace(draw_fence(rng, FENCE_SHARES["low"]), height=LOW)
+    fence = replace(draw_fence(rng, FENCE_SHARES["garden"]), height=HIGH)
     return Boundary(((wall, -0.3), (fence, 0.0)), missing=0.0)
 
 

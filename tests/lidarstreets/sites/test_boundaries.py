@@ -1,7 +1,7 @@
 import numpy as np
 
 from lidarstreets.bodies.fences import Fence
-from lidarstreets.sites.boundaries import LOW_WALL, draw_boundary
+from lidarstreets.sites.boundaries import LOW_WALL_CHANCE, draw_boundary
 
 
 def test_some_gardens_have_a_low_wall_in_front_of_their_fence_or_hedge() -> None:
@@ -14,7 +14,7 @@ def test_some_gardens_have_a_low_wall_in_front_of_their_fence_or_hedge() -> None
         if offset < 0:
             walls.append(layer)
             assert len(boundary.layers) > 1
-    assert abs(len(walls) / len(boundaries) - LOW_WALL) < 0.06
+    assert abs(len(walls) / len(boundaries) - LOW_WALL_CHANCE) < 0.06
     for wall in walls:
         assert isinstance(wall, Fence)
         assert wall.kind in ("wall", "stone wall")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lidarstreets.materials import Label
-from lidarstreets.streets.ground import RARELY_PARKED, Ground, Patch
-from lidarstreets.streets.kinds import KINDS
+from lidarstreets.streets.ground import RARELY_PARKED_SHARE, Ground, Patch
+from lidarstreets.streets.kinds import STREET_KINDS
 from lidarstreets.streets.plans import Island, SideRoad, rounded_union, strip_at
 from lidarstreets.streets.styles import Strip, draw_style
 
@@ -71,7 +71,9 @@ def test_parking_lanes_are_parking_and_bus_bays_are_road(ground: Ground) -> None
         for index, width in enumerate(ground.style.parking):
             if width and ground.is_bay(x):
                 t = (2 * index - 1) * (ground.style.road / 2 + width / 2)
-                is_road = ground.style.is_bus_bay[index] or ground.style.parked <= RARELY_PARKED
+                is_road = (
+                    ground.style.is_bus_bay[index] or ground.style.parked <= RARELY_PARKED_SHARE
+                )
                 assert label_at(ground, x, t) == (Label.ROAD if is_road else Label.PARKING)
 
 
@@ -134,8 +136,8 @@ def test_the_mesh_follows_the_height(ground: Ground) -> None:
 def test_every_kind_of_street_is_drawn() -> None:
     rng = np.random.default_rng(0)
     styles = [draw_style(rng) for _ in range(300)]
-    assert {style.kind for style in styles} == set(KINDS)
-    assert sum(kind.share for kind in KINDS.values()) == pytest.approx(1)
+    assert {style.kind for style in styles} == set(STREET_KINDS)
+    assert sum(kind.share for kind in STREET_KINDS.values()) == pytest.approx(1)
     for style in styles:
         for t, direction in style.lanes:
             assert style.median / 2 < abs(t) < style.road / 2

@@ -1,1 +1,1 @@
-"""Meshes of vehicles and people; x is forward, and all stand on z = 0."""
+"""Make meshes of vehicles and people. They face +x and stand on z = 0; lengths are in metres."""

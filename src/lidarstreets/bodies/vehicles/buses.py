@@ -1,4 +1,4 @@
-"""Meshes of buses and trams."""
+"""Make meshes of buses and trams."""
 
 import numpy as np
 
@@ -56,7 +56,7 @@ def _minibus(rng: np.random.Generator, height: float) -> Mesh:
 
 
 def tram(rng: np.random.Generator) -> Mesh:
-    """Return a tram of two to four sections, which the benchmark counts like a bus."""
+    """Return a tram of two to four sections; the benchmarks count it as a bus."""
     width = rng.uniform(2.2, 2.65)
     length = rng.uniform(6, 9)
     sections = int(rng.integers(2, 5))
@@ -76,7 +76,10 @@ def tram(rng: np.random.Generator) -> Mesh:
 def _section(
     rng: np.random.Generator, length: float, width: float, height: float, axles: tuple[float, ...]
 ) -> Mesh:
-    """Return one stiff section of a bus with a band of windows; axles are shares of its length."""
+    """Return one rigid section of a bus with a band of windows.
+
+    `axles` are the x of its axles as shares of its length.
+    """
     half = length / 2
     sill = rng.uniform(0.9, 1.5)
     lintel = height - rng.uniform(0.3, 0.6)

@@ -1,4 +1,4 @@
-"""Meshes of cars and vans."""
+"""Make meshes of cars and vans."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,18 +14,20 @@ from lidarstreets.tables import read_table
 
 Range = tuple[float, float]
 
-# Shares of vans among all cars, and of convertibles among the types that may be open.
-VANS = 0.09
-CONVERTIBLES = 0.09
-OPEN_TYPES = ("coupe", "city car", "saloon")
+VAN_SHARE = 0.09  # share of vans among all cars
+CONVERTIBLE_SHARE = 0.09  # share of convertibles among the cars of the `OPEN_TYPES`
+OPEN_TYPES = ("coupe", "city car", "saloon")  # types of cars that may be convertibles
 
 CAR_TYPES = read_table(Path(__file__).with_suffix(".toml"))
-SHARES = {name: limits["share"] for name, limits in CAR_TYPES.items()}
+TYPE_SHARES = {name: limits["share"] for name, limits in CAR_TYPES.items()}
 
 
 @dataclass(frozen=True)
 class CarShape:
-    """The proportions of one car, as in cars.toml; all of them are lengths in metres or slants."""
+    """The proportions of one car, in metres. `windscreen` and `tail` are slants, as in cars.toml.
+
+    `belt` is the height of the lower edge of the side windows; `bonnet` and `boot` are lengths.
+    """
 
     length: float
     width: float
@@ -42,17 +44,17 @@ class CarShape:
 
     @property
     def front(self) -> float:
-        """x of the foot of the windscreen."""
+        """x of the foot of the windscreen, metres."""
         return self.half - self.bonnet
 
     @property
     def rear(self) -> float:
-        """x of the foot of the rear window."""
+        """x of the foot of the rear window, metres."""
         return -self.half + self.boot + 0.04
 
     @property
     def roof(self) -> tuple[float, float]:
-        """x of the rear and of the front end of the roof."""
+        """x of the rear and of the front end of the roof, metres."""
         rise = self.height - self.belt
         front = self.front - rise * self.windscreen
         rear = self.rear + rise * self.tail
@@ -65,7 +67,10 @@ class CarShape:
 
 
 def draw_shape(rng: np.random.Generator, limits: dict[str, Range]) -> CarShape:
-    """Draw a car between the limits of a type; one in five lies a little outside."""
+    """Draw the proportions of a car of one type.
+
+    Each proportion lies between the type's `limits`, or in one of five draws a little outside.
+    """
 
     def draw(proportion: str) -> float:
         low, high = limits[proportion]
@@ -89,13 +94,13 @@ def draw_shape(rng: np.random.Generator, limits: dict[str, Range]) -> CarShape:
 
 def car(rng: np.random.Generator) -> Mesh:
     """Return a car or a van of a random shape, size and paint."""
-    if rng.random() < VANS:
+    if rng.random() < VAN_SHARE:
         return van(rng)
 
-    name = weighted_choice(rng, SHARES)
+    name = weighted_choice(rng, TYPE_SHARES)
     shape = draw_shape(rng, CAR_TYPES[name])
     paint = draw_paint(rng, 0.45)
-    is_open = name in OPEN_TYPES and rng.random() < CONVERTIBLES
+    is_open = name in OPEN_TYPES and rng.random() < CONVERTIBLE_SHARE
 
     painted = [_lower_body(rng, shape), *_mirrors(shape)]
     pieces = _seats(rng, shape)
@@ -125,7 +130,7 @@ def car(rng: np.random.Generator) -> Mesh:
 
 
 def _lower_body(rng: np.random.Generator, shape: CarShape) -> np.ndarray:
-    """Return a car below its windows."""
+    """Return the triangles of a car's body below its windows."""
     half = shape.half
     nose = shape.belt - rng.uniform(0.12, 0.32)
     floor = rng.uniform(0.17, 0.30)
@@ -205,7 +210,7 @@ def _roof_load(rng: np.random.Generator, shape: CarShape) -> list[Mesh]:
 
 
 def van(rng: np.random.Generator) -> Mesh:
-    """Return a van of up to 3.5 t: a delivery van or a minibus, which counts as a car."""
+    """Return a delivery van or a minibus of up to 3.5 t, which counts as a car."""
     length = rng.uniform(4.3, 6.2)
     width = rng.uniform(1.75, 2.1)
     height = rng.uniform(1.8, 2.2) if rng.random() < 0.65 else rng.uniform(2.2, 2.75)

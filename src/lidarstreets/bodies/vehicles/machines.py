@@ -1,4 +1,7 @@
-"""Meshes of trailers, caravans, motor homes and machines: SemanticKITTI's other vehicles."""
+"""Make meshes of trailers, caravans, motor homes and machines.
+
+SemanticKITTI labels all of them other-vehicle.
+"""
 
 import numpy as np
 
@@ -75,7 +78,7 @@ def caravan(rng: np.random.Generator) -> Mesh:
 
 
 def camper(rng: np.random.Generator) -> Mesh:
-    """Return a motor home: a van's cab and a living box, often with an alcove over the cab."""
+    """Return a motor home: a living box behind the cab of a van, often with an alcove over it."""
     length = rng.uniform(5.4, 7.5)
     width = rng.uniform(2.0, 2.35)
     height = rng.uniform(2.6, 3.2)
@@ -124,7 +127,7 @@ def _boat_trailer(rng: np.random.Generator) -> Mesh:
 
 
 def _drawbar(length: float, z: float) -> list[np.ndarray]:
-    """Return the bar of a trailer of some length, with the small wheel it rests on."""
+    """Return the bar of a trailer and the small wheel on which it rests, at the height z."""
     tip = length / 2 + 1.1
     return [
         tube((length / 2 - 0.3, -0.4, z), (tip, 0, z), 0.05, sides=4),
@@ -147,7 +150,7 @@ def machine(rng: np.random.Generator) -> Mesh:
 
 
 def excavator(rng: np.random.Generator) -> Mesh:
-    """Return an excavator on tracks, its arm raised or lowered, its body turned."""
+    """Return an excavator on tracks. Its arm is raised or lowered, and its body is turned."""
     size = rng.uniform(0.45, 1.1)
     reach = rng.uniform(2.5, 4.5)
     elbow = (1.2 + reach * 0.5, 0.0, rng.uniform(2.6, 4.2))

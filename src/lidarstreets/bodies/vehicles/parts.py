@@ -1,4 +1,4 @@
-"""Parts that several kinds of vehicles share."""
+"""Make the parts that several kinds of vehicles share."""
 
 from collections.abc import Sequence
 
@@ -8,12 +8,12 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, tube
 
-# Metres: mean distance that a pulse travels behind clear glass until dirt or a reflection ends it.
-CLEAR_GLASS = 4.0
+# Mean distance that a pulse travels behind clear glass before dirt or a reflection ends it, metres.
+CLEAR_GLASS_DEPTH = 4.0
 
 
 def draw_paint(rng: np.random.Generator, light: float) -> Surface:
-    """Draw a paint; `light` is the chance that it is bright."""
+    """Draw a dark or a light paint; `light` is the chance of a light paint."""
     return Surface.LIGHT_PAINT if rng.random() < light else Surface.DARK_PAINT
 
 
@@ -24,7 +24,15 @@ def wheels(
     radius: float,
     thickness: float = 0.22,
 ) -> Mesh:
-    """Return two wheels per axle, each at an x; `width` is the outer distance between them."""
+    """Return two wheels for each axle.
+
+    Args:
+        label: class of the vehicle.
+        axles: x of each axle, metres.
+        width: distance between the outer sides of the two wheels, metres.
+        radius: radius of the wheels, metres.
+        thickness: width of a tyre, metres.
+    """
     tyres = []
     for x in axles:
         for side in (-1, 1):
@@ -35,16 +43,16 @@ def wheels(
 
 
 def glass(solids: Sequence[np.ndarray], label: Label, clear: bool) -> Mesh:
-    """Return convex panes or cabins of glass; pulses pass through clear glass only."""
+    """Return convex panes or cabins of glass; pulses pass only glass that is clear."""
     if not clear:
         return part(solids, Surface.GLASS, label)
 
     outward = [facing_outwards(solid) for solid in solids]
-    return part(outward, Surface.GLASS, label, depth=CLEAR_GLASS)
+    return part(outward, Surface.GLASS, label, depth=CLEAR_GLASS_DEPTH)
 
 
 def facing_outwards(solid: np.ndarray) -> np.ndarray:
-    """Return a convex solid, (T, 3, 3), with corners counter-clockwise seen from outside."""
+    """Return a convex solid, (T, 3, 3), whose corners are counter-clockwise seen from outside."""
     sides = np.diff(solid, axis=1)
     normals = np.cross(sides[:, 0], sides[:, 1])
     middle = solid.reshape(-1, 3).mean(axis=0)
@@ -58,13 +66,13 @@ def facing_outwards(solid: np.ndarray) -> np.ndarray:
 def plates_and_lamps(
     label: Label, half: float, width: float, plate_z: float, lamp_z: float
 ) -> Mesh:
-    """Return the number plates and the lamps of a vehicle that is 2 `half` long, both bright."""
+    """Return the bright number plates and lamps of a vehicle that is 2 * `half` metres long."""
     plates = copies(box((0.03, 0.5, 0.11)), x=[-(half + 0.01), half + 0.01], z=plate_z)
     return join(part([plates], Surface.PLATE, label), lamps(half, width, lamp_z, label))
 
 
 def lamps(half: float, width: float, z: float, label: Label) -> Mesh:
-    """Return the lamps at the four corners of a vehicle, which reflect towards the sensor."""
+    """Return the four lamps at the corners of a vehicle, `z` metres high."""
     lamp = box((0.05, 0.22, 0.11))
     x = [[-(half - 0.01)], [half - 0.02]]
     four = copies(lamp, x=x, y=[-(width / 2 - 0.2), width / 2 - 0.2], z=z)

@@ -1,4 +1,4 @@
-"""Meshes of people who stand, walk, run, sit, crouch or ride."""
+"""Make meshes of people who stand, walk, run, sit, crouch or ride."""
 
 from dataclasses import dataclass
 
@@ -8,20 +8,20 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place, rolled, scaled
 from lidarstreets.solids import Vector, box, copies, hoop, tube
 
-# Metres: thigh, and shin with shoe, of a person who is 1.75 m tall.
+# Lengths of the thigh, and of the shin with the shoe, of a person who is 1.75 m tall, metres.
 THIGH = 0.44
 SHIN = 0.46
 
 
 @dataclass(frozen=True)
 class Posture:
-    """Where the joints of a person are, in metres, for a height of 1.75 m.
+    """Where the joints of a person are who is 1.75 m tall. Lengths are in metres.
 
     Attributes:
-        hip: x and z.
+        hip: x and z of the hip.
         lean: how far the shoulders are in front of the hip.
-        feet: right, left.
-        hands: right, left.
+        feet: places of the right and of the left foot.
+        hands: places of the right and of the left hand.
         torso: length from hip to shoulders.
     """
 
@@ -63,13 +63,17 @@ def figure(
 
 
 def _joint(start: Vector, end: Vector, reach: float, forward: float) -> Vector:
-    """Return knee or elbow between two ends of a limb of length `reach`; it bends along x."""
+    """Return the knee or the elbow of a limb that is `reach` metres long.
+
+    The limb goes from `start` to `end`. The joint is in front if `forward` is 1, behind if it
+    is -1.
+    """
     a = np.array(start)
     b = np.array(end)
     slack = max(reach**2 - float(((b - a) ** 2).sum()), 0.0)
     middle = (a + b) / 2
 
-    # At a right angle to the limb, in the x-z plane.
+    # A unit vector at a right angle to the limb, in the x-z plane.
     across = np.array([a[2] - b[2], 0.0, b[0] - a[0]])
     across /= max(float(np.linalg.norm(across)), 1e-6)
     x, y, z = middle + forward * 0.5 * np.sqrt(slack) * across
@@ -92,9 +96,9 @@ def _draw_hands(rng: np.random.Generator, hip_z: float, lean: float) -> tuple[Ve
 
 
 def person(rng: np.random.Generator) -> Mesh:
-    """Return an adult or a child who stands, walks, runs, bends or crouches, perhaps with things.
+    """Return an adult or a child who stands, walks, runs, bends, crouches or uses a wheelchair.
 
-    They are between 0.9 and 2.0 m tall.
+    They are between 0.9 and 2.0 m tall. Some carry, push or lead something.
     """
     size = rng.normal(1.0, 0.06) if rng.random() < 0.85 else rng.uniform(0.55, 0.9)
     size = float(np.clip(size, 0.55, 1.13))
@@ -135,7 +139,7 @@ def _clothes(rng: np.random.Generator, hip_z: float) -> list[Mesh]:
 
 
 def _things(rng: np.random.Generator, hip_z: float) -> list[Mesh]:
-    """Return what a person carries, pushes or leads; mostly nothing."""
+    """Return what a person carries, pushes or leads; most people have nothing."""
     choice = rng.random()
     if choice < 0.10:
         bag = box((rng.uniform(0.2, 0.45), 0.15, rng.uniform(0.25, 0.45)), (0.05, 0.32, 0.35))
@@ -170,7 +174,7 @@ def _things(rng: np.random.Generator, hip_z: float) -> list[Mesh]:
 
 
 def _dog(rng: np.random.Generator) -> Mesh:
-    """Return a dog, which the benchmark ignores."""
+    """Return a dog, which the benchmarks ignore."""
     size = rng.uniform(0.5, 1.2)
     legs = copies(box((0.07, 0.07, 0.32)), x=[[-0.25], [0.22]], y=[-0.08, 0.08])
     body = tube((-0.3, 0, 0.42), (0.3, 0, 0.45), 0.13, sides=6)
@@ -179,7 +183,7 @@ def _dog(rng: np.random.Generator) -> Mesh:
 
 
 def sitter(rng: np.random.Generator, seat: float = 0.45) -> Mesh:
-    """Return a person who sits on a seat at x = 0, `seat` metres high."""
+    """Return a person who sits at x = 0 on a seat that is `seat` metres high."""
     stretch = rng.uniform(0.0, 0.3)
     feet: tuple[Vector, Vector] = (
         (0.42 + stretch, -0.12, 0.0),
@@ -210,7 +214,7 @@ def _wheelchair_user(rng: np.random.Generator) -> Mesh:
 
 
 def people_group(rng: np.random.Generator) -> list[Mesh]:
-    """Return two to six people who stand or walk close together, around the origin."""
+    """Return two to six people who stand or walk close together around the origin."""
     count = int(rng.integers(2, 7)) if rng.random() < 0.4 else 2
     spread = rng.uniform(0.35, 0.7) * np.sqrt(count)
     walk_together = rng.random() < 0.5
@@ -234,7 +238,12 @@ def rider(
 ) -> Mesh:
     """Return the rider of a two-wheeler.
 
-    `seat` and `grip` are x and z of saddle and handlebar, `feet` are right and left.
+    Args:
+        rng: draws the rider, a backpack and a helmet.
+        label: class of the rider.
+        seat: x and z of the saddle, metres.
+        grip: x and z of the handlebar, metres.
+        feet: places of the right and of the left foot, metres.
     """
     hands: tuple[Vector, Vector] = ((grip[0], -0.28, grip[1]), (grip[0], 0.28, grip[1]))
     lean = float(np.clip(rng.uniform(0.05, 0.42), 0.0, 0.45))

@@ -1,4 +1,4 @@
-"""Meshes of trucks: a chassis, a cab, and what it carries."""
+"""Make meshes of trucks: a chassis, a cab, and what the truck carries."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, prism, tube
 
-SEMI_TRAILERS = 0.10  # share of the trucks
+SEMI_TRAILER_SHARE = 0.10  # share of the trucks that have a semi-trailer
 
 
 def truck(rng: np.random.Generator) -> Mesh:
-    """Return a truck of any kind, from a small box truck to a semi-trailer."""
-    if rng.random() < SEMI_TRAILERS:
+    """Return a truck of any size, from a small box truck to a semi-trailer."""
+    if rng.random() < SEMI_TRAILER_SHARE:
         return _semi_trailer(rng)
 
     length = rng.uniform(5.2, 7.0) if rng.random() < 0.45 else rng.uniform(7.0, 11.0)
@@ -38,7 +38,7 @@ def truck(rng: np.random.Generator) -> Mesh:
     return join(
         cab(rng, half, cab_length, width * rng.uniform(0.92, 1.0), cab_height),
         _chassis(rng, length, width, load.floor, radius),
-        *weighted_choice(rng, LOADS)(rng, load),
+        *weighted_choice(rng, LOAD_SHARES)(rng, load),
     )
 
 
@@ -56,7 +56,7 @@ def cab(rng: np.random.Generator, nose: float, length: float, width: float, heig
         (rear, sill),
     ]  # fmt: skip
 
-    # The upper part: a box of glass between a roof, a back and two posts on each side.
+    # The upper part is a box of glass between a roof, a back and two posts on each side.
     window = box(
         (front - rear - 0.04, width * 0.96, height - sill - 0.3),
         ((front + rear) / 2, 0, sill + 0.01),
@@ -105,7 +105,7 @@ def cab(rng: np.random.Generator, nose: float, length: float, width: float, heig
 def _chassis(
     rng: np.random.Generator, length: float, width: float, floor: float, radius: float
 ) -> Mesh:
-    """Return frame, wheels, tanks and guards; pulses pass under the load between them."""
+    """Return the frame, wheels, tanks and guards of a truck; pulses pass between them."""
     half = length / 2
     rails = copies(box((length - 0.3, 0.12, 0.25), (-0.1, 0, floor - 0.27)), y=[-0.4, 0.4])
     axles = [half - rng.uniform(1.0, 1.5), -half + rng.uniform(1.2, 2.0)]
@@ -156,7 +156,10 @@ def _semi_trailer(rng: np.random.Generator) -> Mesh:
 
 @dataclass(frozen=True)
 class Load:
-    """The space behind the cab, in metres: x of its ends, width, and z of floor and top."""
+    """The space behind the cab: x of its rear and front, its width, and z of its floor and top.
+
+    All are in metres.
+    """
 
     rear: float
     front: float
@@ -204,7 +207,7 @@ def _box_load(rng: np.random.Generator, load: Load) -> list[Mesh]:
 
 
 def _flatbed(rng: np.random.Generator, load: Load) -> list[Mesh]:
-    """Return an open bed with low boards, empty or with timber, pipes, crates or a machine."""
+    """Return an open bed with low boards, empty or with crates, perhaps with a crane."""
     floor = box((load.length, load.width, 0.14), (load.middle, 0, load.floor - 0.14))
     board = rng.uniform(0.2, 0.7)
     boards = [
@@ -242,7 +245,7 @@ def _flatbed(rng: np.random.Generator, load: Load) -> list[Mesh]:
 
 
 def _tipper(rng: np.random.Generator, load: Load) -> list[Mesh]:
-    """Return the trough of a tipper with ribs, heaped with gravel or empty."""
+    """Return the ribbed trough of a tipper, heaped with gravel."""
     height = rng.uniform(0.7, 1.6)
     trough = box(
         (load.length * 0.92, load.width * 0.8, height),
@@ -264,7 +267,7 @@ def _tipper(rng: np.random.Generator, load: Load) -> list[Mesh]:
 
 
 def _tanker(rng: np.random.Generator, load: Load) -> list[Mesh]:
-    """Return a tank lying along the truck, with a catwalk and hatches."""
+    """Return a tank that lies along the truck, with hatches and a ladder."""
     radius = min(load.width / 2, 0.55 * load.height + 0.2)
     z = load.floor + radius * 0.95
     tank = tube((load.rear + 0.2, 0, z), (load.front, 0, z), radius, sides=12)
@@ -349,8 +352,8 @@ def _fire_engine(rng: np.random.Generator, load: Load) -> list[Mesh]:
     ]
 
 
-# What trucks carry, and their shares.
-LOADS: dict[Callable[[np.random.Generator, Load], list[Mesh]], float] = {
+# Functions that make what trucks carry, with their shares.
+LOAD_SHARES: dict[Callable[[np.random.Generator, Load], list[Mesh]], float] = {
     _box_load: 0.52,
     _flatbed: 0.15,
     _tipper: 0.10,

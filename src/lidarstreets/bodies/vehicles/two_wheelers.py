@@ -1,4 +1,4 @@
-"""Meshes of bicycles, scooters and motorcycles, with and without riders."""
+"""Make meshes of bicycles, scooters and motorcycles, with and without riders."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ STAND_LEAN = 0.2  # largest angle in radians at which a parked two-wheeler leans
 
 
 def bicycle(rng: np.random.Generator, label: Label = Label.BICYCLE) -> Mesh:
-    """Return a bicycle of any size, with or without mudguards, basket, bags and child seat."""
+    """Return a bicycle of any size; some have mudguards, a basket, bags or a child seat."""
     radius = rng.uniform(0.32, 0.36) if rng.random() < 0.88 else rng.uniform(0.2, 0.32)
     wheelbase = rng.uniform(1.0, 1.18)
     saddle = rng.uniform(0.78, 1.02)
@@ -46,7 +46,10 @@ def _wheels(label: Label, radius: float, rim: float, wheelbase: float) -> Mesh:
 def _frame(
     label: Label, radius: float, wheelbase: float, heights: tuple[float, float], is_low: bool
 ) -> Mesh:
-    """Return frame, saddle, pedals and handlebar; `heights` are of saddle and bar."""
+    """Return the frame, the saddle, the pedals and the handlebar of a bicycle.
+
+    `heights` are the heights of the saddle and of the handlebar, metres.
+    """
     saddle, bar = heights
     front = wheelbase / 2
     rear = -wheelbase / 2
@@ -73,7 +76,7 @@ def _frame(
 def _bicycle_load(
     rng: np.random.Generator, label: Label, radius: float, wheelbase: float
 ) -> list[Mesh]:
-    """Return mudguards, a rack, a basket, bags and a child seat, each with some chance."""
+    """Return what a bicycle carries: mudguards, a rack, a basket, bags, a child seat or nothing."""
     rear = -wheelbase / 2
     metal = []
     plastic = []
@@ -200,7 +203,7 @@ def _thick_wheels(label: Label, radius: float, wheelbase: float) -> Mesh:
 
 
 def bicyclist(rng: np.random.Generator) -> Mesh:
-    """Return a bicycle and its rider, both of one class, perhaps with a trailer for a child."""
+    """Return a bicycle and its rider with the class bicyclist, perhaps with a child's trailer."""
     turn = rng.uniform(0, np.pi)
     high = 0.28 + 0.17 * float(np.sin(turn))
     low = 0.28 - 0.17 * float(np.sin(turn))
@@ -221,7 +224,7 @@ def bicyclist(rng: np.random.Generator) -> Mesh:
 
 
 def motorcyclist(rng: np.random.Generator) -> Mesh:
-    """Return a motorcycle and its rider, both of one class, perhaps with a passenger."""
+    """Return a motorcycle and its rider with the class motorcyclist, perhaps with a passenger."""
     feet: tuple[Vector, Vector] = ((0.12, -0.24, 0.22), (0.12, 0.24, 0.22))
     grip = (0.32, 1.03)
     pieces = [motorcycle(rng, Label.MOTORCYCLIST)]
