@@ -300,7 +300,7 @@ def test_a_run_takes_no_folder_with_files_of_its_names(
     mine.write_bytes(MINE if "weights" not in name else (world / "w.safetensors").read_bytes())
     before = contents(tmp_path)
     line = refusal(f"train semantickitti-compact --data {world}/data --out {tmp_path} --resume")
-    assert "a new folder or that of a run" in line
+    assert "a new folder or the folder of a run" in line
     assert contents(tmp_path) == before
 
 

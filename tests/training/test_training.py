@@ -612,7 +612,8 @@ def test_a_new_head_is_trained_on_the_networks_of_weights_with_another_one(
 ) -> None:
     options = ("--stage", "head", "--init", run, "--model.point_head.fc", 12)
     weights = train(world, tmp_path / "run", *options)
-    assert "head: new, as that of the initial weights has other sizes" in capsys.readouterr().out
+    line = "head: new, because the head of the initial weights has other sizes"
+    assert line in capsys.readouterr().out
     assert weights.model.point_head.fc == 12
     assert differing(load(run), weights) == {"point_head"}
 

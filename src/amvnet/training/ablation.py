@@ -1,4 +1,7 @@
-"""Studies that train: heads by tau and by neighbours, and the range-view network's ablation."""
+"""Studies that train networks: heads by tau and by neighbours, and an ablation of the range view.
+
+They repeat Fig. 8 and Table 5 of the paper.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from amvnet.training.run_folder import is_run
 from amvnet.weights.file import Weights
 from amvnet.weights.parts import replace_part
 
-# Whether with the GRU, and whether with class weights.
+# The variants of the ablation: whether it has the GRU, and whether it has class weights.
 VARIANTS = ((False, False), (True, False), (False, True), (True, True))
 
 
@@ -33,10 +36,11 @@ def sweep_heads(
     """Train a head for each value of a parameter, and yield its figures (Fig. 8 of the paper).
 
     Args:
-        plan: how the heads are trained. Each head is kept in a folder inside the plan's folder, and
-            not trained again if it is finished.
-        models: by value, the configuration with this value.
+        plan: how the heads are trained. Each head is kept in a folder inside the plan's folder. It
+            is not trained again if it is finished.
+        models: the configurations by the value of the parameter.
         weights: the weights with the networks that the heads are trained for.
+        device: the device on which the heads are scored, such as "cpu" or "cuda".
 
     Raises:
         InputError: if a folder holds a head for other networks, other scans or another recipe.
@@ -66,7 +70,7 @@ def with_tau(model: ModelConfig, tau: float) -> ModelConfig:
 
 
 def _networks(weights: Weights, model: ModelConfig) -> Weights:
-    """Return the two networks of some weights, for a head of another configuration."""
+    """Return the two networks of some weights in another configuration, without a head."""
     networks = Weights(model, weights.taxonomy, weights.sensor)
     for part in BOTH_NETWORKS:
         networks = replace_part(networks, part, weights)
@@ -82,13 +86,15 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
     """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
 
     Args:
-        plan: how the networks are trained; each is kept in a folder of the plan's.
+        plan: how the networks are trained. Each network is kept in a folder inside the plan's.
+        device: the device on which the networks are scored, such as "cpu" or "cuda".
 
     Yields:
-        Whether with the GRU, whether with class weights, and the figures of `metrics`.
+        Whether the network has the GRU, whether its loss has class weights, and its figures as
+        `metrics` returns them.
 
     Raises:
-        InputError: if a folder holds a run on other scans or of another recipe.
+        InputError: if a folder holds a run on other scans or with another recipe.
     """
     for gru, weighted in VARIANTS:
         name = _name(gru, weighted)

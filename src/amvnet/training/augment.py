@@ -1,4 +1,4 @@
-"""Augmentation of training scans (section 3.1 of the paper), and of scores for the head."""
+"""Augment training scans (section 3.1 of the paper), and the scores that the head learns from."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from torch import Tensor
 from amvnet.config.schema import AugmentConfig
 from amvnet.scan import Scan
 
-ELEVATION_BINS = 64  # take the place of the lasers of a scan without ring indices
-OUTLIERS = 0.5  # percent of the points below the lowest bin, and above the highest
+ELEVATION_BINS = 64  # number of bins that replace the lasers of a scan without ring indices
+OUTLIERS = 0.5  # share of the points below the lowest bin, and above the highest bin, percent
 
-MOST_LASERS = 0.5  # largest share of the lasers that is dropped at random
-MOST_BLOCKS = 4  # dropped from one scan
-BLOCK_WIDTH = (5.0, 40.0)  # degrees of azimuth
-BLOCK_HEIGHT = (3.0, 12.0)  # degrees of elevation
-BANDS = (3, 6)  # bands of elevation of mixed scans, fewest and most; LaserMix's own numbers
-TURNS = (1, 2)  # turned copies of pasted objects, fewest and most
+LARGEST_LASER_DROP = 0.5  # largest share of the lasers that is dropped at random
+MOST_BLOCKS = 4  # most blocks that are dropped from a scan
+BLOCK_WIDTH = (5.0, 40.0)  # least and greatest width of a block, degrees of azimuth
+BLOCK_HEIGHT = (3.0, 12.0)  # least and greatest height of a block, degrees of elevation
+BANDS = (3, 6)  # fewest and most bands of elevation in mixed scans, as in LaserMix
+TURNS = (1, 2)  # fewest and most turned copies of pasted objects
 
-HOTTEST = 3.0  # largest softmax temperature
-CONFUSED = 0.25  # chance of each class of being confused with another
-LARGEST_LEAK = 0.8  # of a confused class's probability that goes to the other class
-WAVES = (0.5, 3.0)  # waves of the confusion around the sensor, and per 20 m of range
-WAVE_RANGE = 20.0  # metres
+HIGHEST_TEMPERATURE = 3.0  # highest temperature of the softmax
+CONFUSION_CHANCE = 0.25  # probability that a class is confused with another class
+LARGEST_LEAK = 0.8  # largest share of a confused class's probability that the other class gets
+WAVES = (0.5, 3.0)  # fewest and most waves of the confusion, around the sensor and along a range
+WAVE_RANGE = 20.0  # the range along which these waves are counted, metres
 
 
 def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan:
-    """Return a randomly changed copy of a scan; the same generator state gives the same copy.
+    """Return a randomly changed copy of a scan. The same state of `rng` gives the same copy.
 
     Points are dropped, scaled, mirrored, jittered, rotated about the vertical, lifted and tilted.
     Intensities are scaled, distorted, shifted, or all set to zero.
     """
-    # The order of the random draws decides which scan a seed gives: keep it.
+    # Keep the order of the random draws, because it decides which scan a seed gives.
     if config.no_lasers and rng.random() < config.no_lasers:
         scan = dataclasses.replace(scan, ring=None)
     if config.laser_drop and rng.random() < config.laser_drop:
@@ -59,7 +59,7 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
         xyz = xyz @ tilt_rotation(roll, pitch).T
 
     intensity = np.minimum(scan.points[:, 3] * _intensity_gain(config, rng), 1)
-    # What has no intensity stays without one.
+    # A scan without intensities stays without them.
     if intensity.any():
         intensity = _distort_intensity(intensity, scan, config, rng)
     points = np.column_stack([xyz, intensity]).astype(np.float32)
@@ -69,8 +69,8 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
 def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
     """Replace a sector of a scan with the same sector of another scan (Xiao et al., 2022).
 
-    The sector spans a quarter to three quarters of the circle. A scan that would have no point left
-    is returned unchanged.
+    The sector spans a quarter to three quarters of the circle. If the result would have no point,
+    the scan is returned unchanged.
     """
     start = rng.uniform(-np.pi, np.pi)
     width = rng.uniform(0.5, 1.5) * np.pi
@@ -82,10 +82,10 @@ def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
 
 
 def mix_lasers(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
-    """Replace every second band of elevation with that of another scan (Kong et al., 2023).
+    """Replace every second band of elevation with the same band of another scan.
 
-    The bands are equally high and cover both scans. A scan that would have no point left is
-    returned unchanged.
+    The bands have the same height and cover both scans. If the result would have no point, the scan
+    is returned unchanged. This is LaserMix (Kong et al., 2023).
     """
     bands = int(rng.integers(BANDS[0], BANDS[1] + 1))
     first = int(rng.integers(2))
@@ -104,8 +104,11 @@ def mix_lasers(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
 def paste(scan: Scan, other: Scan, classes: Sequence[int], rng: np.random.Generator) -> Scan:
     """Add the points of some classes of another scan (Xiao et al., 2022).
 
-    They are added at their place, and once or twice more, rotated by a random yaw. What they hide
-    stays in the scan.
+    The points are added at their place, and once or twice more after a rotation by a random yaw.
+    Points behind them stay in the scan.
+
+    Args:
+        classes: train ids of the classes.
     """
     assert other.labels is not None
     objects = other.select(np.isin(other.labels, classes) & other.valid)
@@ -121,27 +124,31 @@ def paste(scan: Scan, other: Scan, classes: Sequence[int], rng: np.random.Genera
 
 
 def disturb(scores: Tensor, points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Return the scores of one network for a scan, less certain and wrong in places.
+    """Make the scores of one network for a scan less certain, and wrong in places.
 
-    All probabilities are softened by one softmax temperature. Then a part of the probability of
-    some classes goes to another class, more in some directions and at some ranges than in others.
-    So the head learns to trust the networks less than on scans like the scans of their training.
+    All probabilities are softened by one softmax temperature. Then some classes lose a part of
+    their probability to another class. They lose more in some directions and at some ranges than
+    elsewhere. The scores then resemble scores on scans unlike the networks' training scans, so the
+    head learns to trust the networks less.
 
     Args:
-        scores: (P, K) probabilities, as is the result.
-        points: (P, 4) x, y, z, intensity.
+        scores: (P, K) probabilities.
+        points: (P, 4) x, y, z in metres, and intensity.
+
+    Returns:
+        (P, K) probabilities.
     """
-    temperature = float(np.exp(rng.uniform(0, np.log(HOTTEST))))
+    temperature = float(np.exp(rng.uniform(0, np.log(HIGHEST_TEMPERATURE))))
     softened = scores.clamp_min(1e-7).log().div(temperature).softmax(dim=1)
 
     classes = scores.shape[1]
     leak = np.eye(classes, dtype=np.float32)
-    for confused in np.flatnonzero(rng.random(classes) < CONFUSED):
+    for confused in np.flatnonzero(rng.random(classes) < CONFUSION_CHANCE):
         share = rng.uniform(0, LARGEST_LEAK)
         leak[confused, confused] -= share
         leak[confused, rng.integers(classes)] += share
 
-    # From 0 to 1, in waves around the sensor and away from it.
+    # The strength of the confusion goes from 0 to 1, in waves around the sensor and away from it.
     azimuth = torch.atan2(points[:, 1], points[:, 0])
     distance = points[:, :2].norm(dim=1)
     around = round(rng.uniform(*WAVES)) * azimuth
@@ -162,7 +169,7 @@ def yaw_rotation(yaw: float) -> np.ndarray:
 def tilt_rotation(roll: float, pitch: float) -> np.ndarray:
     """Return the (3, 3) matrix that rotates x, y, z about x by `roll`, then about y by `pitch`.
 
-    Both are in radians.
+    Both angles are in radians.
     """
     about_x = np.eye(3)
     about_x[1:, 1:] = yaw_rotation(roll)
@@ -174,8 +181,8 @@ def tilt_rotation(roll: float, pitch: float) -> np.ndarray:
 def lasers(scan: Scan) -> np.ndarray:
     """Return the (N,) index of each point's laser, 0 or above.
 
-    If the lasers are unknown, it is the row of the range image, or else one of `ELEVATION_BINS`
-    equal bins of elevation, which come near to the lasers of an HDL-64E.
+    If the lasers are unknown, the rows of the range image take their place. If the rows are unknown
+    also, `ELEVATION_BINS` equal bins of elevation do, which resemble the lasers of an HDL-64E.
     """
     if scan.ring is not None:
         return scan.ring
@@ -195,11 +202,11 @@ def _drop_points(scan: Scan, largest_share: float, rng: np.random.Generator) -> 
 
 
 def _drop_lasers(scan: Scan, rng: np.random.Generator) -> Scan:
-    """Drop every second laser, or a random share of them up to `MOST_LASERS`."""
+    """Drop every second laser, or a random share of the lasers up to `LARGEST_LASER_DROP`."""
     laser = lasers(scan)
     count = laser.max(initial=0) + 1
     draws = rng.random(count)
-    share = rng.uniform(0, MOST_LASERS)
+    share = rng.uniform(0, LARGEST_LASER_DROP)
     odd = rng.integers(2)
 
     keep = draws >= share
@@ -232,7 +239,7 @@ def _intensity_gain(config: AugmentConfig, rng: np.random.Generator) -> float:
 def _distort_intensity(
     intensity: np.ndarray, scan: Scan, config: AugmentConfig, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return (N,) intensities of a scan in [0, 1], as another calibration would give them."""
+    """Return the (N,) intensities that another calibration might give, in [0, 1]."""
     if config.intensity_gamma:
         exponent = np.exp(rng.uniform(-config.intensity_gamma, config.intensity_gamma))
         intensity = np.maximum(intensity, 0) ** exponent
@@ -247,7 +254,7 @@ def _distort_intensity(
 
 
 def _in_sector(scan: Scan, start: float, width: float) -> np.ndarray:
-    """Return (N,) bool: the points whose azimuth is at most `width` radians beyond `start`."""
+    """Return (N,) bool: whether a point's azimuth is at most `width` radians beyond `start`."""
     azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
     return (azimuth - start) % (2 * np.pi) < width
 
@@ -259,7 +266,7 @@ def _elevations(scan: Scan) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> np.ndarray:
-    """Return the lowest and the highest value without `OUTLIERS`; zeros if none is finite."""
+    """Return the lowest and the highest value without `OUTLIERS`, or zeros if none is finite."""
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
         return np.zeros(2)
@@ -272,7 +279,7 @@ def _keep(scan: Scan, mask: np.ndarray) -> Scan:
 
 
 def _join(scan: Scan, other: Scan) -> Scan:
-    """Return the first scan with the points of both."""
+    """Return a copy of the first scan that has the points of both scans."""
     return dataclasses.replace(
         scan,
         points=np.concatenate([scan.points, other.points]),
@@ -291,7 +298,7 @@ def _join_labels(scan: Scan, other: Scan) -> np.ndarray | None:
 def _join_indices(
     first: np.ndarray | None, second: np.ndarray | None, scan: Scan, other: Scan
 ) -> np.ndarray | None:
-    """Return the rings or rows of both scans, -1 for the points of a scan that has none."""
+    """Return the rings or rows of both scans. Points of a scan without them get -1."""
     if first is None and second is None:
         return None
     if first is None:

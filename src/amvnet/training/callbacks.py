@@ -1,4 +1,4 @@
-"""Lightning callbacks of a training: weights, seeds, lines."""
+"""Callbacks of Lightning that average and write weights, seed batches, and report epochs."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from amvnet.weights.file import Weights, part_state, save
 
 
 class AverageWeights(Callback):
-    """Keeps an exponential moving average of the weights, which is validated and written.
+    """Keeps an exponential moving average of the weights. The average is validated and written.
 
-    The statistics of batch norms are averaged as well. The training itself goes on with its own
+    The statistics of batch norms are averaged as well. The training itself continues with its own
     weights.
 
     Args:
-        decay: share of the average that a step keeps. Early steps keep less, so that the initial
-            weights are soon forgotten. 0 keeps the weights of the last step alone.
-        initial_share: share of the initial weights in those that are validated and written
-            (WiSE-FT: Wortsman et al., Robust fine-tuning of zero-shot models, 2022).
+        decay: share of the average that a step keeps, in [0, 1]. Early steps keep less, so that the
+            initial weights are soon forgotten. 0 keeps only the weights of the last step.
+        initial_share: share of the initial weights in the weights that are validated and written,
+            in [0, 1] (WiSE-FT: Wortsman et al., Robust fine-tuning of zero-shot models, 2022).
     """
 
     def __init__(self, decay: float, initial_share: float = 0.0) -> None:
@@ -39,8 +39,8 @@ class AverageWeights(Callback):
         self.initial_share = initial_share
         self.initial: dict[str, Tensor] = {}
         self.average: dict[str, Tensor] = {}
-        self.steps = 0  # that are in the average
-        self._raw: dict[str, Tensor] = {}  # the weights of the training, while it is validated
+        self.steps = 0  # number of steps that are in the average
+        self._raw: dict[str, Tensor] = {}  # the training's own weights during a validation
 
     def state_dict(self) -> dict[str, Any]:
         return {"initial": self.initial, "average": self.average, "steps": self.steps}
@@ -65,7 +65,7 @@ class AverageWeights(Callback):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        # A step may take several batches, whose gradients are accumulated.
+        # A step may take several batches, because gradients may be accumulated.
         if trainer.global_step == self.steps:
             return
 
@@ -88,7 +88,7 @@ class AverageWeights(Callback):
         self._raw = {}
 
     def weights(self) -> dict[str, Tensor]:
-        """Return the average, mixed with the initial weights by their share."""
+        """Return the average, mixed with the share `initial_share` of the initial weights."""
         weights = dict(self.average)
         for name, initial in self.initial.items():
             if initial.is_floating_point():
@@ -99,7 +99,8 @@ class AverageWeights(Callback):
 class KeepWeights(Callback):
     """Writes last.safetensors, best.safetensors and `SETTINGS` of a stage after each epoch.
 
-    The best weights have the highest validation mIoU, or without validation are the last.
+    The best weights are the weights with the highest mIoU in the validation. If nothing is
+    validated, they are the last ones.
     """
 
     def __init__(
@@ -110,11 +111,11 @@ class KeepWeights(Callback):
         self.weights = weights
         self.settings = stage_settings(plan, name, weights)
         self.record: dict[str, Any] = {}
-        if plan.processes.first:  # the others do not write
+        if plan.processes.first:  # other processes do not write
             sensor = sensor_record(plan.scans.dataset, plan.scans.train, intensity)
             self.record = stage_record(plan, self.settings, sensor)
-        self.started = time.monotonic()  # a clock may be set back
-        self.highest = -1.0  # mIoU of the best weights so far
+        self.started = time.monotonic()  # unlike the system's clock, it is never set back
+        self.highest = -1.0  # mIoU of the best weights so far, in [0, 1]
 
     def state_dict(self) -> dict[str, Any]:
         return {"highest": self.highest}
@@ -146,7 +147,7 @@ class KeepWeights(Callback):
             write_yaml(self.folder / SETTINGS, self.settings)
 
     def _trained(self, state: dict[str, Tensor], metrics: dict[str, float]) -> Weights:
-        """Return the weights of the trained part alone, given its parameters."""
+        """Return weights that hold only the trained part, given its parameters."""
         seconds = round(time.monotonic() - self.started)
         return dataclasses.replace(
             self.weights,
@@ -157,7 +158,7 @@ class KeepWeights(Callback):
 
 
 class SeedBatches(Callback):
-    """Seeds PyTorch before each training batch, so that a resumed run repeats its draws."""
+    """Seeds PyTorch before each training batch, so that a resumed run draws the same numbers."""
 
     def __init__(self, seed: int, rank: int = 0) -> None:
         self.seed = seed
@@ -174,11 +175,13 @@ class SeedBatches(Callback):
 
 
 class EpochLines(Callback):
-    """Says one line per epoch; used if there is no terminal for a progress bar.
+    """Reports a line for each epoch. It is used if there is no terminal for a progress bar.
 
     Args:
-        later: the epochs of the stages that follow; the whole time left assumes that each takes as
-            long as one of this stage.
+        report: a function that prints a line.
+        name: the name of the stage.
+        later: the number of epochs in the later stages. The estimate of the whole time left assumes
+            that each of them takes as long as an epoch of this stage.
     """
 
     def __init__(self, report: Reporter, name: str, later: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""The check of a training's scans before its first epoch, and the class counts that it gives."""
+"""Check the scans of a training before its first epoch, and count the points of each class."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ SHOWN_SCANS = 3  # most broken scans that a message names
 
 
 def check_data(plan: Plan) -> np.ndarray:
-    """Check all labels of the scans of a training, and say what may be a mistake.
+    """Check all labels of the scans of a training, and report what may be a mistake.
 
     Returns:
-        (K,) int64: how many points of each class the training scans of an epoch have.
+        (K,) int64, the number of points of each class in the training scans of an epoch.
 
     Raises:
         InputError: if a label has an unknown id, a scan cannot be read, or there is nothing to
@@ -57,25 +57,25 @@ def keep_counts(plan: Plan, counts: np.ndarray) -> None:
 def _datasets_of(
     plan: Plan,
 ) -> Iterator[tuple[Dataset, Mapping[str, Sequence[ScanRecord]], Sequence[ScanRecord]]]:
-    """Yield each dataset of a training, its scans by split, and the scans of the first epoch."""
+    """Yield each dataset of a training, its scans by split, and its scans in the first epoch."""
     scans = plan.scans
-    joined = scans.dataset
-    if not isinstance(joined, Joined):
-        yield joined, {"train": scans.train, "val": scans.val}, scans.train
+    dataset = scans.dataset
+    if not isinstance(dataset, Joined):
+        yield dataset, {"train": scans.train, "val": scans.val}, scans.train
         return
 
     mixed = [record for record in scans.train if isinstance(record, MixedRecord)]
     own = [record for record in scans.train if not isinstance(record, MixedRecord)]
-    yield joined.dataset, {"train": own, "val": scans.val}, own
-    for member, other in enumerate(joined.others, start=1):
+    yield dataset.dataset, {"train": own, "val": scans.val}, own
+    for member, other in enumerate(dataset.others, start=1):
         in_epoch = [record.original for record in mixed if record.member == member]
-        # Streets of later epochs are simulated when it is their turn.
+        # The streets of later epochs are simulated when they are needed.
         is_simulated = isinstance(other.dataset, SimulatedStreets)
         yield other.dataset, {"train": in_epoch if is_simulated else other.train}, in_epoch
 
 
 def _refuse(checked: Report) -> None:
-    """Raise InputError if a report has an error."""
+    """Raise InputError if the check has found an error."""
     for error in checked.errors():
         raise InputError(error)
 

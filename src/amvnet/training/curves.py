@@ -1,4 +1,4 @@
-"""A picture of a training's curves: the loss, the mIoU by epoch and the IoU by class."""
+"""Draw the curves of a training: the loss, the mIoU by epoch and the IoU by class."""
 
 from __future__ import annotations
 
@@ -10,22 +10,25 @@ from typing import Any
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.files import atomic_write
 
-SIZE = (12.0, 3.6)  # inches, of the row of a stage
+ROW_SIZE = (12.0, 3.6)  # width and height of the row of a stage, inches
 DOTS_PER_INCH = 120
-FEW = 30  # points of a curve that are marked
+MOST_MARKED = 30  # curves with fewer points than this have markers
+
+# Names of the metrics in TensorBoard's files.
 LOSS = "train/loss"
 MIOU = "val/miou"
-CLASS = "iou/"  # beginning of the names of the classes' metrics
+CLASS_IOU = "iou/"  # followed by the name of the class
 
 
 @dataclass(frozen=True)
 class Curves:
-    """What a stage logged.
+    """The metrics that a stage logged.
 
     Attributes:
-        loss: at each logged step, the epoch (1.0 is the end of the first) and the loss.
-        miou: of the validation by epoch, in [0, 1].
-        iou: by class, in the order of the classes, at the last epoch; absent classes are left out.
+        loss: the epoch and the loss of each logged step. An epoch of 1.0 is the end of the first.
+        miou: the mIoU of each validation, in [0, 1].
+        iou: the IoU of each class at the last epoch, in [0, 1], in the order of the classes. Absent
+            classes are left out.
     """
 
     loss: Sequence[tuple[float, float]]
@@ -37,8 +40,9 @@ def read_curves(folder: Path, taxonomy: Taxonomy, epochs: int) -> Curves:
     """Read the curves of a stage from its TensorBoard files.
 
     Args:
-        folder: of the stage; files without the metrics give empty curves.
-        epochs: epochs of the stage.
+        folder: the folder of the stage. If its files lack a metric, the curve is empty.
+        taxonomy: the classes.
+        epochs: number of epochs of the stage.
     """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -47,31 +51,36 @@ def read_curves(folder: Path, taxonomy: Taxonomy, epochs: int) -> Curves:
     names = set(events.Tags()["scalars"])
 
     def by_step(name: str) -> dict[int, float]:
-        # A resumed run repeats the steps after its checkpoint: the last value counts.
+        # A resumed run repeats the steps after its checkpoint. The last value counts.
         return {event.step: event.value for event in events.Scalars(name)} if name in names else {}
 
     loss = sorted(by_step(LOSS).items())
     miou = [value for _, value in sorted(by_step(MIOU).items())]
     validated = by_step(MIOU)
-    last = max([*validated, *(step for step, _ in loss)], default=0) + 1  # steps of the stage
+    steps = max([*validated, *(step for step, _ in loss)], default=0) + 1
     iou = {}
     for name in taxonomy.classes:
-        values = by_step(f"{CLASS}{name}")
+        values = by_step(f"{CLASS_IOU}{name}")
         if values and max(values) == max(validated, default=-1):
             iou[name] = values[max(values)]
-    return Curves([((step + 1) / last * epochs, value) for step, value in loss], miou, iou)
+    return Curves([((step + 1) / steps * epochs, value) for step, value in loss], miou, iou)
 
 
 def draw_curves(stages: Mapping[str, Curves], path: Path) -> Path:
-    """Draw the curves of stages by their name, a row of three diagrams each; return the PNG."""
+    """Draw the curves of stages into a PNG file, and return its path.
+
+    Args:
+        stages: the curves by the name of the stage. Each stage gets a row of three diagrams.
+    """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    figure = Figure(figsize=(SIZE[0], SIZE[1] * len(stages)), layout="constrained")
+    width, height = ROW_SIZE
+    figure = Figure(figsize=(width, height * len(stages)), layout="constrained")
     rows = figure.subplots(len(stages), 3, squeeze=False)
     for (name, curves), (loss, miou, iou) in zip(stages.items(), rows, strict=True):
         if curves.loss:
-            marker = "." if len(curves.loss) < FEW else ""
+            marker = "." if len(curves.loss) < MOST_MARKED else ""
             loss.plot(*zip(*curves.loss, strict=True), color="black", linewidth=1, marker=marker)
         loss.set_xlim(left=0)
         _label(loss, f"{name}: loss", "epoch")
@@ -83,7 +92,7 @@ def draw_curves(stages: Mapping[str, Curves], path: Path) -> Path:
         miou.set_ylim(bottom=0)
 
         names = list(curves.iou)[::-1]  # the first class at the top
-        titles = [key.replace("$", "\\$") for key in names]  # no formulas
+        titles = [key.replace("$", "\\$") for key in names]  # Matplotlib draws $...$ as formulas
         iou.barh(titles, [100 * curves.iou[key] for key in names], color="0.55")
         iou.tick_params(axis="y", labelsize=7)
         _label(iou, f"{name}: IoU by class (%), last epoch", "")

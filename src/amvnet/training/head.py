@@ -1,4 +1,4 @@
-"""The training of the point head (section 3.3 of the paper)."""
+"""Train the point head (section 3.3 of the paper)."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ from amvnet.training.plan import Plan
 from amvnet.training.stage import Loaders, Stage, fit
 from amvnet.weights.file import UNCERTAIN, Weights
 
-VAL_FACTOR = 64  # a validation batch is as large as this many training batches
+VAL_FACTOR = 64  # size of a validation batch, in training batches
 
 
 class HeadStage(Stage):
-    """Stage `head`: it learns from scores gathered beforehand, so that the networks stay frozen.
-
-    `Stage` documents the other arguments.
+    """Stage `head`. It learns from scores that were gathered beforehand by frozen networks.
 
     Args:
-        train, val: the points to train and to validate with; None for no validation.
+        head: the point head.
+        train: the points to learn from.
+        val: the points to validate with, or None to validate nothing.
+        shared: the arguments of `Stage`.
     """
 
     name = "head"
-    in_float32 = True  # it multiplies so little that a lower precision would save nothing
+    in_float32 = True  # the head is so small that a lower precision would save nothing
     config: HeadTraining
 
     def __init__(
@@ -49,7 +50,8 @@ class HeadStage(Stage):
         point, rows, labels, _ = batch
         total_loss = F.cross_entropy(self.trained(point, rows), labels - 1, reduction="sum")
 
-        # The mean is over the batch of all processes; Lightning averages the processes' gradients.
+        # Lightning averages the gradients of all processes. The factor makes the loss the mean over
+        # the whole batch.
         count = labels.new_tensor(len(labels)).float()
         total_count = self.trainer.strategy.reduce(count, reduce_op="sum")
         loss = total_loss * self.processes.size / total_count
@@ -62,14 +64,14 @@ class HeadStage(Stage):
         point, rows, labels, stands_for = batch
         prediction = self.trained(point, rows).argmax(dim=1) + 1
 
-        # Each point counts for as many points of its scan as it stands for.
+        # Each point counts as many times as the number of points that it stands for.
         size = len(self.matrix)
         cells = (labels * size + prediction).cpu().numpy()
         counts = np.bincount(cells, stands_for.cpu().numpy(), size**2)
         self.matrix += counts.reshape(size, size)
 
     def whole_matrix(self) -> np.ndarray:
-        """Return AMVNet's confusion matrix: the head's, plus the ensemble's of certain points."""
+        """Return AMVNet's confusion matrix: the head's, plus the ensemble's for certain points."""
         assert self.val_points is not None
         return super().whole_matrix() + self.val_points.certain
 
@@ -92,6 +94,10 @@ class HeadStage(Stage):
 def train_head(plan: Plan, weights: Weights) -> None:
     """Train the point head on scores of frozen networks, and write its weights after each epoch.
 
+    Args:
+        plan: the plan of the run.
+        weights: the weights of both networks, and the head's weights to begin with, if any.
+
     Raises:
         InputError: if a network is missing, or the scans have too few points for the head.
     """
@@ -99,7 +105,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
     config = training.head
     folder = plan.out / "head"
 
-    # Other models scored the scans as they are; networks need the intensities they learnt.
+    # Other models have scored the scans already. Networks expect intensities as in their training.
     intensity = None
     if plan.scores is None:
         for part in BOTH_NETWORKS:
@@ -129,7 +135,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
     )
     fit(stage, plan, _make_loaders(plan, train, val), weights, intensity)
 
-    # The gathered points take much space, and no process needs them any more.
+    # Remove the gathered points, which take much space, when no process needs them any more.
     plan.processes.wait()
     if plan.processes.first:
         for name in ("train", "val"):
@@ -137,7 +143,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
 
 
 def _make_loaders(plan: Plan, train: HeadPoints, val: HeadPoints | None) -> Loaders:
-    """Return this process's parts of the batches."""
+    """Return the loaders of this process's parts of the batches."""
     training = plan.recipe.training
     sampler = PointSampler(train.labels, training.head, training.seed, plan.processes)
     train_loader = _loader(train, sampler)

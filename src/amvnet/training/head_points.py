@@ -1,6 +1,6 @@
-"""Training data of the point head: uncertain points gathered once, then loaded in random batches.
+"""Gather the uncertain points that the point head learns from, and load them in random batches.
 
-Sections 3.2 and 3.3 of the paper.
+The points are gathered once, before the first epoch. Sections 3.2 and 3.3 of the paper define them.
 """
 
 from __future__ import annotations
@@ -33,24 +33,25 @@ from amvnet.training.loaders import EpochOrder, Key, ScanSet, collate
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights
 
-# Takes a scan and the batch of its P valid points; returns f and g, (P, K).
+# Takes a scan and the batch of its P valid points. Returns the probabilities f and g, (P, K).
 Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]
 
-# Features p_i (U, 2 K + 4), features of the neighbours S_i (U, n, 2 K + 4), train ids (U,), and how
-# many uncertain points of its scan each point stands for (U,), as only some are drawn.
+# U uncertain points: their features p_i (U, 2 K + 4), the features of their neighbours S_i
+# (U, n, 2 K + 4), their train ids (U,), and the number of uncertain points of its scan that each
+# stands for (U,). Only some of the uncertain points of a scan are drawn.
 HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class HeadPoints:
-    """The labelled uncertain points of some scans on disk, and statistics of all their points.
+    """The labelled uncertain points of some scans on disk, and statistics of all labelled points.
 
     Args:
         paths: the files of the points, one for each process that scored scans.
-        dtype: of a point.
-        files: (U,) the index of each point's file; the points of a file are in their order here.
-        labels: (U,) train ids.
+        dtype: the type of a point in the files.
+        files: (U,) index of each point's file. The points of a file are in the same order here.
+        labels: (U,) train ids of the points.
         certain: (K + 1, K + 1) confusion matrix of the ensemble over the certain points.
-        uncertain_share: share of the labelled points that are uncertain.
+        uncertain_share: share of the labelled points that are uncertain, in [0, 1].
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class HeadPoints:
         self.uncertain_share = uncertain_share
 
         self._files = files
-        self._rows = np.empty(len(files), dtype=np.int64)  # of each point in its file
+        self._rows = np.empty(len(files), dtype=np.int64)  # the place of each point in its file
         for number in range(len(paths)):
             is_here = files == number
             self._rows[is_here] = np.arange(np.count_nonzero(is_here))
@@ -79,7 +80,7 @@ class HeadPoints:
         return len(self.labels)
 
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
-        """Return the points with these (U,) indices, in this order."""
+        """Return the points with some (U,) indices, in the order of the indices."""
         points = np.empty(len(index), dtype=self.dtype)
         for number, path in enumerate(self.paths):
             is_here = self._files[index] == number
@@ -95,15 +96,18 @@ class HeadPoints:
 
 
 class PointSampler(EpochOrder):
-    """Draws the batches of an epoch from the points on disk, other points in each epoch.
+    """Draws the batches of an epoch from the points on disk, different points in each epoch.
 
-    With several processes, each takes its part of every batch. A smaller last batch is left out, as
-    batch norm learns nothing good from a few points.
+    If there are several processes, each takes its part of every batch. A last batch that is not
+    full is left out, because the statistics of a few points would harm batch norm.
 
     Args:
         labels: (U,) train ids of the points.
-        config: the points of a batch and of an epoch. To balance the classes, a point of a class
-            with n points is drawn in proportion to n ** -balance, and may be drawn several times.
+        config: the number of points in a batch and in an epoch. To balance the classes, a point of
+            a class with n points is drawn with a probability proportional to n ** -balance. It may
+            then be drawn several times.
+        seed: the seed of the random order.
+        processes: the processes that share the batches.
     """
 
     def __init__(
@@ -128,7 +132,7 @@ class PointSampler(EpochOrder):
             yield batch[self.processes.rank :: self.processes.size]
 
     def _draw(self, rng: np.random.Generator) -> np.ndarray:
-        """Return the indices of an epoch's points, in a random order."""
+        """Return the (D,) indices of the points of an epoch, in a random order."""
         if self.cumulative is None:
             return rng.permutation(self.size)[: self.drawn]
 
@@ -141,11 +145,12 @@ class PointGatherer:
     """Scores scans by two networks, and keeps their uncertain points on disk for the head.
 
     Attributes:
-        plan: of the run; all of its processes must see the folder of the points. If it has two
-            other models' scores, these are used instead of the networks'.
-        weights: the networks.
-        intensity: of the networks' training; those of each scan are brought to it before the
-            augmentation. None for other models' scores.
+        plan: the plan of the run. All its processes must see the folder of the points. If it has
+            the scores of two other models, these are used instead of the networks.
+        weights: the weights of the networks.
+        intensity: the distribution of intensities that the networks learnt. The intensities of each
+            scan are matched to it before the augmentation. It is None for the scores of other
+            models.
     """
 
     plan: Plan
@@ -162,14 +167,16 @@ class PointGatherer:
     ) -> HeadPoints:
         """Gather the labelled uncertain points of some scans.
 
-        If the networks agree everywhere, as they do before they have learnt anything, the points
-        are drawn from all labelled points instead.
+        Networks that have learnt nothing yet agree everywhere. The points are then drawn from all
+        labelled points instead.
 
         Args:
-            folder: receives the points; its earlier content is removed.
-            views: how often each scan is scored, each time augmented differently; 0 to score it
-                once, without augmentation. Other models' scores are of the scans as they are.
-            tau: the threshold of the assertion; 0 takes the model's.
+            records: the scans.
+            folder: the folder that receives the points. Its earlier content is removed.
+            views: how many times each scan is scored, each time with another augmentation. If it is
+                0, or the scores come from other models, each scan is taken once and unchanged.
+            tau: the threshold of the assertion; 0 takes the threshold of the model.
+            report: a function that prints a line about what happens.
 
         Raises:
             InputError: if the scans have too few labelled points.
@@ -188,12 +195,12 @@ class PointGatherer:
             lasers=self.weights.model.range_view.lasers,
         )
         keys = list(product(range(max(views, 1)), range(len(scans))))
-        least = max(2, self.plan.processes.size)  # batch norm needs two, and each process one
+        least = max(2, self.plan.processes.size)  # batch norm needs two points, a process one
 
         assertion = Disagreement(tau or self.weights.model.assertion.threshold)
         points = self._gather(scans, keys, folder, assertion, report)
         if len(points) < least:
-            report("head: the networks agree everywhere; it learns from points drawn from all")
+            report("head: the networks agree everywhere, so it learns from all kinds of points")
             share = points.uncertain_share
             points = self._gather(scans, keys, folder, _everywhere, report)
             points.uncertain_share = share
@@ -206,7 +213,7 @@ class PointGatherer:
         return points
 
     def _scorer(self) -> Scorer:
-        """Return what scores a scan."""
+        """Return the function that scores a scan."""
         if self.plan.scores is not None:
             return self._read_scores
         model = self.plan.build(self.weights).to(self._device)
@@ -219,7 +226,7 @@ class PointGatherer:
     def _read_scores(
         self, record: ScanRecord, scan: Scan, batch: PointBatch
     ) -> tuple[Tensor, Tensor]:
-        """Return two other models' scores of a scan."""
+        """Return the scores of two other models for a scan, each (P, K)."""
         assert self.plan.scores is not None
         classes = self.weights.taxonomy.size
         f, g = self.plan.scores.read(Path(record.prediction), scan, classes)
@@ -235,7 +242,11 @@ class PointGatherer:
         assertion: Assertion,
         report: Reporter,
     ) -> HeadPoints:
-        """Gather the points that an assertion finds uncertain, of some views of scans."""
+        """Gather the points that an assertion finds uncertain in some views of scans.
+
+        Args:
+            keys: the views: pairs of a view's number and a scan's index.
+        """
         processes = self.plan.processes
         if processes.first:
             shutil.rmtree(folder, ignore_errors=True)
@@ -263,7 +274,7 @@ class PointGatherer:
                 if tenths.ends(number, len(share)):
                     report(f"head: scored {number * len(keys) // len(share)} of {len(keys)} scans")
 
-        # The points of all scans, in their order; the processes take the scans in turns.
+        # Put the points in the order of the scans, which the processes have taken in turns.
         labels_by_rank = processes.gather(labels_of_scans)
         ordered = []
         files = []
@@ -290,8 +301,8 @@ class PointGatherer:
         """Score one scan, and draw at most `points_per_scan` of its uncertain points.
 
         Returns:
-            (U,) points, their (U,) uint8 train ids, and the (2, K + 1, K + 1) confusion matrices
-            of the ensemble over the certain and over all uncertain points of the scan.
+            (U,) points, their (U,) uint8 train ids, and two confusion matrices of the ensemble,
+            (2, K + 1, K + 1): over the certain points of the scan, and over all uncertain points.
         """
         device = self._device
         seeds = [self.plan.recipe.training.seed, *key]
@@ -343,14 +354,21 @@ class PointGatherer:
 
 
 def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
-    """Find every point uncertain: an `Assertion`."""
+    """Return (P,) True: an `Assertion` that finds every point uncertain."""
     return torch.ones(len(f), dtype=torch.bool, device=f.device)
 
 
 def _ensemble_matrices(f: Tensor, g: Tensor, labels: Tensor, uncertain: Tensor) -> np.ndarray:
-    """Return the ensemble's confusion matrices over the certain and over the uncertain points.
+    """Return two confusion matrices of the ensemble, over the certain and the uncertain points.
 
-    They are (2, K + 1, K + 1) int64, given scores (P, K), train ids (P,) and (P,) bool.
+    Args:
+        f: (P, K) probabilities of the range view.
+        g: (P, K) probabilities of the bird's-eye view.
+        labels: (P,) train ids.
+        uncertain: (P,) bool.
+
+    Returns:
+        (2, K + 1, K + 1) int64.
     """
     prediction = (geometric_mean(f, g).argmax(dim=1) + 1).cpu().numpy()
     truth = labels.cpu().numpy()

@@ -1,4 +1,4 @@
-"""Batches of training scans: read from disk, augmented, collated."""
+"""Read training scans from disk, augment them, and collate them to batches."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity, match_scan
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
-Key = tuple[int, int]  # epoch, index in the list of scans
+Key = tuple[int, int]  # the epoch, and the index of a scan in the list of scans
 
-# Small or rare objects of both benchmarks, which are pasted into other scans. Cars are common.
-PASTED = frozenset(
+# The classes of small or rare objects in both benchmarks, which are pasted into other scans. Cars
+# are common enough.
+PASTED_CLASSES = frozenset(
     {
         "barrier",
         "bicycle",
@@ -45,13 +46,18 @@ PASTED = frozenset(
 class ScanSet(data.Dataset[Scan]):
     """Labelled scans by epoch and index.
 
-    The augmentation depends only on seed, epoch and index: it is the same on any number of
-    processes. Augmented scans belong to the epoch (`Dataset.at_epoch`).
+    The augmentation depends only on the seed, the epoch and the index, so that it is the same for
+    any number of processes. Augmented scans belong to the epoch (`Dataset.at_epoch`).
 
     Args:
-        augment: how they are augmented, or None for scans as they are.
-        intensity: what the intensities of each scan are brought to, before its augmentation.
-        lasers: number of lasers to look for in scans without rings (`with_lasers`); 0: none.
+        dataset: the dataset that reads the scans.
+        records: the scans.
+        augment: how the scans are augmented, or None to leave them unchanged.
+        seed: the seed of the augmentation.
+        intensity: the distribution to which the intensities of each scan are matched before its
+            augmentation.
+        lasers: number of lasers to look for in scans without rings (`with_lasers`); 0 looks for
+            none.
     """
 
     def __init__(
@@ -71,7 +77,7 @@ class ScanSet(data.Dataset[Scan]):
         self.lasers = lasers
 
         classes = enumerate(dataset.taxonomy.classes, start=1)
-        self.pasted = [train_id for train_id, name in classes if name in PASTED]
+        self.pasted = [train_id for train_id, name in classes if name in PASTED_CLASSES]
 
     def __len__(self) -> int:
         return len(self.records)
@@ -81,7 +87,7 @@ class ScanSet(data.Dataset[Scan]):
         if self.augment is None:
             return self._read(self.records[index])
 
-        # The order of the random draws decides which scan a seed gives: keep it.
+        # Keep the order of the random draws, because it decides which scan a seed gives.
         config = self.augment
         rng = np.random.default_rng([self.seed, epoch, index])
         scan = self._draw(key, rng)
@@ -94,7 +100,7 @@ class ScanSet(data.Dataset[Scan]):
         return scan
 
     def _draw_other(self, epoch: int, rng: np.random.Generator) -> Scan:
-        """Return a random scan of an epoch, augmented, to mix with another one."""
+        """Return a random scan of an epoch, augmented. It is mixed with another scan."""
         index = int(rng.integers(len(self)))
         return self._draw((epoch, index), rng)
 
@@ -118,14 +124,14 @@ class ScanSet(data.Dataset[Scan]):
                 f"{scan.name}: expected at least two valid points to train with, found {valid}; "
                 "leave the scan out"
             )
-        # Not after the augmentation, which changes the order of the points and the intensity.
+        # Do this before the augmentation, which changes the order and the intensity of the points.
         if self.lasers:
             scan = with_lasers(scan, self.lasers)
         return match_scan(scan, self.intensity)
 
 
 class EpochOrder(data.Sampler[Any]):
-    """The base of samplers whose random order depends on seed and epoch."""
+    """The base class of samplers whose random order depends on a seed and the epoch."""
 
     def __init__(self, seed: int, processes: Processes = ALONE) -> None:
         self.seed = seed
@@ -137,15 +143,15 @@ class EpochOrder(data.Sampler[Any]):
         self.epoch = epoch
 
     def rng(self) -> np.random.Generator:
-        """Return the generator of the epoch's order."""
+        """Return the random generator that decides the order of the epoch."""
         return np.random.default_rng([self.seed, self.epoch])
 
 
 class EpochSampler(EpochOrder):
     """Draws every scan once per epoch, in a random order.
 
-    With several processes, each takes its part of every batch. All processes draw equally many
-    scans: if the scans cannot be shared equally, the first ones are drawn again.
+    If there are several processes, each takes its part of every batch. All processes draw the same
+    number of scans. If the scans cannot be shared equally, the first scans are drawn again.
     """
 
     def __init__(self, size: int, seed: int, processes: Processes = ALONE) -> None:
@@ -157,7 +163,7 @@ class EpochSampler(EpochOrder):
 
     def __iter__(self) -> Iterator[Key]:
         total = len(self) * self.processes.size
-        order = np.resize(self.rng().permutation(self.size), total)  # repeats the first ones
+        order = np.resize(self.rng().permutation(self.size), total)  # repeats the first scans
         for index in self.processes.share(order.tolist()):
             yield self.epoch, index
 
@@ -171,12 +177,14 @@ def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
 def make_loader(
     scans: ScanSet, batch: int, workers: int, shuffle: bool, processes: Processes = ALONE
 ) -> data.DataLoader[tuple[PointBatch, Tensor]]:
-    """Make a loader of this process's batches; the last one of an epoch may be smaller.
+    """Make a loader of this process's batches. The last batch of an epoch may be smaller.
 
     Args:
-        batch: scans in a batch of one process.
-        workers: processes that read scans; 0 to read in this one.
-        shuffle: draw the scans of each epoch by an `EpochSampler`, as in training.
+        scans: the scans to load.
+        batch: number of scans in a batch of one process.
+        workers: number of processes that read scans; 0 reads them in this process.
+        shuffle: whether an `EpochSampler` draws the scans of each epoch, as in training.
+        processes: the processes that share the scans.
     """
     sampler: data.Sampler[Any] | list[Key] = EpochSampler(len(scans), scans.seed, processes)
     if not shuffle:
@@ -188,5 +196,5 @@ def make_loader(
         num_workers=workers,
         collate_fn=collate,
         persistent_workers=workers > 0,
-        pin_memory=torch.cuda.is_available(),  # so that batches go to a GPU while it computes
+        pin_memory=torch.cuda.is_available(),  # so that a GPU computes while it receives batches
     )

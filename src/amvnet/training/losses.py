@@ -14,23 +14,23 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-# A rarer class gets the weight of one with this frequency, so that a few points cannot dominate a
-# step.
+# The lowest class frequency that class weights take into account. A rarer class gets the weight of
+# a class with this frequency, so that a few points cannot dominate a step.
 FREQUENCY_FLOOR = 1e-4
 
-# Lovász-softmax leaves out smaller errors. Together they would add less than this to the loss of a
-# class.
+# The smallest error that Lovász-softmax takes into account. All smaller errors together would add
+# less than this to the loss of a class.
 MIN_ERROR = 1e-3
 
 
 def class_weights(counts: np.ndarray) -> np.ndarray:
     """Return the square roots of the inverse class frequencies, scaled to a mean of 1.
 
-    A frequency below `FREQUENCY_FLOOR` is raised to it, also that of an absent class. Section 4.2
-    of the paper.
+    Frequencies below `FREQUENCY_FLOOR` are raised to it; the frequency of an absent class is 0.
+    This is section 4.2 of the paper.
 
     Args:
-        counts: (K,) numbers of points of each class in the training data.
+        counts: (K,) number of points of each class in the training data.
 
     Returns:
         (K,) float32.
@@ -42,13 +42,13 @@ def class_weights(counts: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Scored:
-    """The points, pixels or voxels of a batch of scans that a loss is over.
+    """The P points, pixels or voxels of a batch of scans that a loss compares with their labels.
 
     Attributes:
         logits: (P, K).
-        labels: (P,) train ids.
-        scan: (P,) number of the scan of each, 0..scans - 1.
-        scans: B.
+        labels: (P,) train ids; 0 is ignored.
+        scan: (P,) index of the scan in the batch, 0..scans - 1.
+        scans: B, the number of scans.
     """
 
     logits: Tensor
@@ -59,12 +59,12 @@ class Scored:
 
 @dataclass(frozen=True)
 class Targets:
-    """What a region loss compares probabilities (P, K) with.
+    """The labels that a region loss compares with probabilities (P, K).
 
     Attributes:
         classes: (P,) index of the class of each point, 0..K - 1.
-        scan: (P,) number of its scan.
-        counts: (B, K) points of each class in each scan.
+        scan: (P,) index of the scan of each point, 0..B - 1.
+        counts: (B, K) number of points of each class in each scan.
     """
 
     classes: Tensor
@@ -73,22 +73,23 @@ class Targets:
 
     @classmethod
     def of(cls, classes: Tensor, scan: Tensor, shape: tuple[int, int]) -> Targets:
-        """Return the targets of B scans and K classes, given `shape`: (B, K)."""
+        """Return the targets of B scans and K classes, where `shape` is (B, K)."""
         scans, class_count = shape
         counts = classes.new_zeros(scans * class_count)
         counts.scatter_add_(0, scan * class_count + classes, torch.ones_like(classes))
         return cls(classes, scan, counts.view(shape))
 
     def shares(self, dtype: torch.dtype) -> Tensor:
-        """Return the (B, K) shares of the classes in a mean over scans of means over classes.
+        """Return the (B, K) share of each class of each scan in the loss of the batch.
 
-        A class that is absent from a scan has none. A scan without points counts as 0.
+        The loss is a mean over the scans, each of which has the mean over its classes. A class that
+        is absent from a scan has the share 0. The loss of a scan without points is 0.
         """
         present = (self.counts > 0).to(dtype)
         return present / (present.sum(dim=1, keepdim=True).clamp_min(1) * len(present))
 
 
-RegionLoss = Callable[[Tensor, Targets], Tensor]  # of (P, K) probabilities
+RegionLoss = Callable[[Tensor, Targets], Tensor]  # takes (P, K) probabilities, returns a scalar
 
 
 def network_loss(
@@ -97,13 +98,14 @@ def network_loss(
     """Return the mean over scans of cross-entropy + a region loss.
 
     Args:
-        scored: the points; those with label 0 are ignored.
+        scored: the points, pixels or voxels. Entries with label 0 are ignored.
         weights: (K,) class weights of the cross-entropy, or None for equal weights.
-        region: weight of the region loss; that of the cross-entropy is 1.
+        region: weight of the region loss. The weight of the cross-entropy is 1.
         region_loss: `dice` or `lovasz_softmax`.
 
     Returns:
-        The loss, (), float32, or float64 if the logits are. A scan without labels counts as 0.
+        The loss: a scalar of type float32, or float64 if the logits have it. The loss of a scan
+        without labels is 0.
     """
     labelled = (scored.labels > 0).nonzero()[:, 0]
     logits = scored.logits.index_select(0, labelled)
@@ -112,7 +114,7 @@ def network_loss(
     scan = scored.scan.index_select(0, labelled)
     targets = Targets.of(classes, scan, (scored.scans, logits.shape[1]))
 
-    # Each point counts by the weight of its class, in proportion to all points of its scan.
+    # The share of a point in the loss of its scan is proportional to the weight of its class.
     weighted_counts = targets.counts.to(logits) if weights is None else targets.counts * weights
     weight_of_class = logits.new_ones(logits.shape[1]) if weights is None else weights.to(logits)
     totals = weighted_counts.sum(dim=1).clamp_min(torch.finfo(logits.dtype).tiny)
@@ -134,12 +136,12 @@ def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> 
         classes: K.
 
     Returns:
-        (M,) int64; 0 for a cell without points.
+        (M,) int64 train ids; 0 for a cell without labelled points.
     """
     ids = classes + 1
     points = torch.bincount(cells * ids + labels, minlength=count * ids).view(count, ids)
 
-    # The lowest id first among those with equally many points, on any device.
+    # Ranks make the lowest of equally frequent ids win on any device.
     ranks = torch.arange(classes, 0, -1, device=cells.device)
     order = points[:, 1:] * ids + ranks
     return torch.where(points[:, 1:].any(dim=1), order.argmax(dim=1) + 1, 0)
@@ -148,8 +150,12 @@ def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> 
 def dice(probabilities: Tensor, targets: Targets) -> Tensor:
     """Return the soft Dice loss: 1 - 2 |p t| / (|p| + |t|), averaged over the classes present.
 
-    The probabilities p are (P, K), and t is the one-hot encoding of the classes. The loss is a
-    scalar, the mean over the scans.
+    Args:
+        probabilities: p, (P, K).
+        targets: the labels; t is their one-hot encoding.
+
+    Returns:
+        The mean over the scans, a scalar.
     """
     truth = F.one_hot(targets.classes, probabilities.shape[1]).to(probabilities)
     members = F.one_hot(targets.scan, len(targets.counts)).to(probabilities).T  # (B, P)
@@ -165,21 +171,25 @@ def dice(probabilities: Tensor, targets: Targets) -> Tensor:
 def lovasz_softmax(probabilities: Tensor, targets: Targets) -> Tensor:
     """Return the Lovász extension of the Jaccard loss, averaged over the classes present.
 
-    For each class the errors |t - p| are sorted, largest first. Each is weighted by the increase of
-    the Jaccard loss when its point joins the mispredicted ones (Berman et al., CVPR 2018). Errors
-    up to `MIN_ERROR` are left out, which saves most of the sorting.
+    For each class, the errors |t - p| are sorted, largest first. Each error is weighted by the
+    increase of the Jaccard loss when its point joins the mispredicted points (Berman et al., CVPR
+    2018). Errors up to `MIN_ERROR` are left out, which saves most of the sorting.
 
-    The probabilities p are (P, K), and t is 1 for the points of the class, else 0. The loss is a
-    scalar, the mean over the scans.
+    Args:
+        probabilities: p, (P, K).
+        targets: the labels; t is 1 for the points of the class, else 0.
+
+    Returns:
+        The mean over the scans, a scalar.
     """
     classes = probabilities.shape[1]
     with torch.no_grad():  # the order and the increases have no gradient
         truth = F.one_hot(targets.classes, classes).bool()
         errors = torch.where(truth, 1 - probabilities, probabilities)
         is_large = (errors > MIN_ERROR) & (targets.counts > 0)[targets.scan]
-        index = is_large.flatten().nonzero()[:, 0]  # of errors, point by point
+        index = is_large.flatten().nonzero()[:, 0]  # (M,) indices into the flattened errors
 
-        # A group is a class of a scan.
+        # A group holds the errors of one class in one scan.
         point = index // classes
         group = targets.scan[point] * classes + index % classes
         order = _order(group, errors.flatten()[index])
@@ -196,8 +206,8 @@ def lovasz_softmax(probabilities: Tensor, targets: Targets) -> Tensor:
 
 
 def _order(group: Tensor, errors: Tensor) -> Tensor:
-    """Return the order of errors (M,) by group (M,), the largest first."""
-    # Numbers from 0 are ordered as their bits are: one sort of whole numbers does both.
+    """Return the (M,) indices that sort errors (M,) by group (M,), and the largest error first."""
+    # Floats from 0 have the order of their bits, so one sort of whole numbers sorts by both.
     bits = errors.to(torch.float32).view(torch.int32).long()
     return (group * 2**32 - bits).argsort()
 
@@ -206,20 +216,21 @@ def _jaccard_increases(is_true: Tensor, group: Tensor, counts: Tensor) -> Tensor
     """Return how much the Jaccard loss increases as each point in turn becomes mispredicted.
 
     Args:
-        is_true: (M,) bool: whether a point is of the class of its group; the points are sorted by
-            group, and within it by falling error.
-        group: (M,) ascending.
-        counts: (G,) points of the class of each group, including those with a small error.
+        is_true: (M,) bool: whether the point has the class of its group. The points are sorted by
+            group, and by decreasing error within a group.
+        group: (M,) group of each point, ascending.
+        counts: (G,) number of points that have the class of each group, including points with a
+            small error.
 
     Returns:
         (M,) float32.
     """
     sizes = torch.zeros_like(counts).scatter_add_(0, group, torch.ones_like(group))
-    before = sizes.cumsum(0) - sizes  # points before each group
-    true = is_true.cumsum(0)  # whole numbers: exact, however many
+    before = sizes.cumsum(0) - sizes  # number of points before each group
+    true = is_true.cumsum(0)  # whole numbers, which stay exact
     true_before = F.pad(true, (1, 0))[before]
 
-    # Within the group, up to each point.
+    # Counts within the group, up to each point.
     place = torch.arange(1, len(group) + 1, device=group.device) - before[group]
     missed = true - true_before[group]
     total = counts[group]

@@ -1,4 +1,4 @@
-"""The training of the two networks (section 3.1 of the paper)."""
+"""Train the two networks (section 3.1 of the paper)."""
 
 from __future__ import annotations
 
@@ -38,18 +38,20 @@ REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 
 
 class NetworkStage(Stage):
-    """The base of the two networks' stages, which learn from batches of scans by AdamW.
+    """The base class of the stages `rv` and `bev`, which learn from batches of scans by AdamW.
 
-    A subclass defines `logits`. `Stage` documents the other arguments.
+    A subclass defines `logits`.
 
     Args:
-        view, net: the projection, and the network on it.
+        view: the projection.
+        net: the network, which takes what the projection returns.
         weights: (K,) class weights of the loss, or None for equal weights.
+        shared: the arguments of `Stage`.
     """
 
     config: NetworkTraining
     view: RangeView | PolarView
-    default_region_loss: RegionLoss  # the paper's
+    default_region_loss: RegionLoss  # the region loss that the paper uses
 
     def __init__(
         self,
@@ -64,20 +66,21 @@ class NetworkStage(Stage):
         self.class_weights: Tensor | None
         tensor = None if weights is None else torch.from_numpy(weights)
         self.register_buffer("class_weights", tensor, persistent=False)
-        # Batches of the epoch, and how many of them have a label to learn from.
+        # The number of batches in the epoch, and the number of batches with a labelled point.
         self.batches = 0
         self.labelled: Tensor | int = 0
 
     def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
-        """Return what the loss is over, and the (P, K) logits of all points.
+        """Return the pixels or voxels that the loss compares, and the (P, K) logits of all points.
 
         Args:
+            batch: the P valid points of some scans.
             labels: (P,) train ids.
         """
         raise NotImplementedError
 
     def loss(self, scored: Scored) -> Tensor:
-        """Return the mean loss over scans: it does not change if a batch is split."""
+        """Return the mean loss over the scans, so that a batch may be split into parts."""
         region_loss = REGION_LOSSES.get(self.config.region_loss, self.default_region_loss)
         return network_loss(scored, self.class_weights, self.config.region, region_loss)
 
@@ -86,7 +89,7 @@ class NetworkStage(Stage):
         scored, _ = self.logits(points, labels)
         loss = self.loss(scored)
         self.batches += 1
-        self.labelled += (scored.labels > 0).any().int()  # stays on the device
+        self.labelled += (scored.labels > 0).any().int()  # a tensor, so that a GPU need not wait
 
         self.check_finite(loss, f"at the scans {', '.join(points.names)}")
         self.log("train/loss", loss, prog_bar=True, batch_size=points.count)
@@ -117,12 +120,12 @@ class NetworkStage(Stage):
     def step_factor(self, count: int, index: int) -> float:
         """Return the factor that makes the gradient of a step the mean over its scans.
 
-        Lightning divides the loss of each part of a batch by the number of parts. In the last batch
-        of an epoch there may be fewer parts, and fewer scans in the last of them.
+        Lightning divides the loss of each part of a batch by the number of parts. The last batch
+        of an epoch may have fewer parts, and its last part may have fewer scans.
 
         Args:
-            count: scans in this part.
-            index: which part of the epoch it is, from 0.
+            count: number of scans in this part.
+            index: index of this part in the epoch, from 0.
         """
         parts = self.trainer.accumulate_grad_batches
         loader = self.trainer.train_dataloader
@@ -130,13 +133,13 @@ class NetworkStage(Stage):
             return 1.0
 
         batch = parts * loader.batch_size
-        before = index // parts * batch  # scans of the earlier steps
+        before = index // parts * batch  # number of scans in the earlier steps
         in_step = min(batch, len(loader.sampler) - before)
         return count * parts / in_step
 
     def configure_optimizers(self) -> Any:
-        # On a GPU one launch takes the whole step. Lightning cannot clip the scaled gradients of
-        # float16 then.
+        # On a GPU, a fused optimizer takes the whole step in one launch. With it, Lightning cannot
+        # clip the scaled gradients of float16.
         is_fused = self.device.type == "cuda" and self.trainer.precision != "16-mixed"
         optimizer = torch.optim.AdamW(
             self.trained.parameters(),
@@ -148,7 +151,7 @@ class NetworkStage(Stage):
 
 
 class RangeStage(NetworkStage):
-    """Stage `rv`: the loss is over pixels, labelled by the points they show."""
+    """Stage `rv`. Its loss compares pixels; a pixel has the label of the point that it shows."""
 
     name = "rv"
     view: RangeView
@@ -171,7 +174,7 @@ class RangeStage(NetworkStage):
 
 
 class PolarStage(NetworkStage):
-    """Stage `bev`: the loss is over voxels, each with the label of most of its points."""
+    """Stage `bev`. Its loss compares voxels; a voxel has the most frequent label of its points."""
 
     name = "bev"
     view: PolarView
@@ -184,11 +187,11 @@ class PolarStage(NetworkStage):
 
 
 def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
-    """Return the voxels with points, each with the label of most of them.
+    """Return the voxels that have points, each with the most frequent label of its points.
 
     Args:
         view: the grids of B scans.
-        scores: (M, Z * K) logits of the pillars with points.
+        scores: (M, Z * K) logits of the M pillars that have points.
         labels: (P,) train ids.
     """
     scans, radial, angular, vertical = view.shape
@@ -203,11 +206,16 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
 
 
 def train_network(plan: Plan, name: str, weights: Weights) -> None:
-    """Train a network in the stage rv or bev, and write its weights after each epoch.
+    """Train a network in the stage `rv` or `bev`, and write its weights after each epoch.
+
+    Args:
+        plan: the plan of the run.
+        name: the stage, "rv" or "bev".
+        weights: the weights to begin with.
 
     Raises:
-        InputError: if the weights do not fit the recipe, a scan is broken, or a GPU's memory does
-            not suffice.
+        InputError: if the weights do not fit the recipe, a scan is broken, or the memory of the GPU
+            is too small.
     """
     config = getattr(plan.recipe.training, name)
     if config.initial and PART_OF[name] not in weights.parts:
@@ -219,12 +227,12 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     model = plan.build(weights)
     intensity = _intensity(plan, weights)
     loaders = make_loaders(plan, config, intensity)
-    # The weights of the classes in the loss (section 4.2 of the paper).
-    of_classes = None
+    # The class weights of the loss (section 4.2 of the paper).
+    loss_weights = None
     if config.class_weights:
         assert plan.class_counts is not None
-        of_classes = class_weights(plan.class_counts)
-    stage = make_stage(plan, name, model, of_classes)
+        loss_weights = class_weights(plan.class_counts)
+    stage = make_stage(plan, name, model, loss_weights)
     try:
         fit(stage, plan, loaders, weights, intensity)
     except torch.OutOfMemoryError:
@@ -237,7 +245,11 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
 def make_stage(
     plan: Plan, name: str, model: AMVNet, weights: np.ndarray | None
 ) -> RangeStage | PolarStage:
-    """Return the stage rv or bev of a model, given the (K,) class weights of its loss."""
+    """Return the stage `rv` or `bev` of a model.
+
+    Args:
+        weights: (K,) class weights of the loss, or None for equal weights.
+    """
     config = getattr(plan.recipe.training, name)
     shared: dict[str, Any] = {
         "config": config,
@@ -254,12 +266,12 @@ def make_stage(
 def make_loaders(
     plan: Plan, config: NetworkTraining, intensity: TrainedIntensity | None
 ) -> Loaders:
-    """Return the batches of scans to learn from, and to validate with."""
+    """Return the loaders of the batches to learn from, and to validate with."""
     training = plan.recipe.training
     scans = plan.scans
     shared: dict[str, Any] = {"workers": training.workers, "processes": plan.processes}
 
-    # Scans that one process takes at a time.
+    # The number of scans that one process takes at a time.
     batch = config.batch // config.accumulate // plan.processes.size
     how: dict[str, Any] = {"intensity": intensity, "lasers": plan.recipe.model.range_view.lasers}
     train_set = ScanSet(scans.dataset, scans.train, training.augment, training.seed, **how)
@@ -271,7 +283,10 @@ def make_loaders(
 
 
 def _intensity(plan: Plan, weights: Weights) -> TrainedIntensity | None:
-    """Return what the intensities of each scan are brought to, as in a prediction."""
+    """Return the distribution to which the intensities of each scan are matched, as `predict` does.
+
+    If it is None, intensities stay unchanged.
+    """
     dataset = plan.scans.dataset
     if isinstance(dataset, SimulatedStreets):
         return simulated_intensity(dataset.sensor)

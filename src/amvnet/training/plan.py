@@ -31,19 +31,21 @@ class Plan:
 
     Attributes:
         recipe: what to train.
-        scans: to train on and to validate with. Without validation scans, the last weights are
-            kept as the best.
+        scans: the scans to train on and to validate with. If there are no scans to validate with,
+            the last weights are kept as the best.
         out: the folder of the run.
         resume: continue an earlier run in the same folder.
         report: a function that prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
-        processes: those that share the run; all must see its folder.
-        scores: two other models' scores of the scans, to train the head on instead of on the
-            networks'; None without other models.
-        also_read: files besides the scans that the run reads; what names no file is left out.
-        class_counts: (K,) points of each class in the training scans of an epoch; None before the
-            scans are checked.
-        stages: the stages of this call in order, for the whole time left; empty if unknown.
+        processes: the processes that share the run. All of them must see its folder.
+        scores: the scores of two other models for the scans. If they are given, the head learns
+            from them instead of from the scores of the networks.
+        also_read: files besides the scans that the run reads. Entries that name no file are
+            ignored.
+        class_counts: (K,) number of points of each class in the training scans of an epoch. The
+            check of the scans sets it.
+        stages: the stages of this call in order, from which the time left is estimated; empty if
+            they are unknown.
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, or the recipe is for
@@ -102,11 +104,14 @@ class Plan:
         """Open the datasets of a training run, and return its plan.
 
         Args:
-            recipe: what to train; sizes and classes come from `init` if the recipe says so.
-            data: datasets as `open_dataset` takes them. The training scans of the second and later
-                ones are mixed in.
-            choose: returns the scans of the first dataset to train on and to validate with.
-            init: weights to begin with.
+            recipe: what to train. Sizes and classes come from `init` if the recipe says so.
+            data: the datasets, as `open_dataset` takes them. The training scans of the second and
+                of later datasets are mixed in.
+            out: the folder of the run.
+            choose: a function that returns the scans of the first dataset to train on and to
+                validate with.
+            init: the weights to begin with.
+            report: a function that prints a line about what happens.
             settings: further attributes of the plan.
 
         Raises:
@@ -120,11 +125,11 @@ class Plan:
         return cls(recipe, scans, out, report=report, **settings)
 
     def build(self, weights: Weights) -> AMVNet:
-        """Return the model of some weights; parts that they lack are initialised at random.
+        """Return a model with some weights. Parts that the weights lack are initialised at random.
 
         Raises:
-            InputError: if the parameters do not fit the sizes, which are those of the recipe for a
-                part to train.
+            InputError: if the parameters do not fit the sizes of the model. The recipe states the
+                sizes of a part that is to be trained.
         """
         try:
             return weights.build(with_head=True)
@@ -133,10 +138,10 @@ class Plan:
 
 
 def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
-    """Return a recipe with the classes, sensor and sizes of weights, if it asks for them.
+    """Return a recipe with the classes, the sensor and the sizes of `init`, if it asks for them.
 
     Raises:
-        InputError: if it does, and there are no weights.
+        InputError: if the recipe asks for them, and `init` is None.
     """
     if not recipe.from_init:
         return recipe
@@ -156,9 +161,9 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
 def without_weight_averaging(
     recipe: Recipe, init: Weights | None, classes: Taxonomy, report: Reporter
 ) -> Recipe:
-    """Return a recipe that averages no weights with initial weights for other classes.
+    """Return the recipe without weight averaging if the initial weights have other classes.
 
-    The last layers of such weights are new, and of no use in an average.
+    Their last layers would then be replaced by new ones, which are useless in an average.
     """
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
@@ -167,7 +172,7 @@ def without_weight_averaging(
     for name in ("rv", "bev"):
         config = getattr(recipe.training, name)
         if config.initial:
-            report(f"{name}: no mean with the initial weights, which have other classes")
+            report(f"{name}: no average with the initial weights, which have other classes")
             networks[name] = dataclasses.replace(config, initial=0.0)
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
@@ -175,11 +180,12 @@ def without_weight_averaging(
 def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None = None) -> Dataset:
     """Open the dataset of a training.
 
-    A user's own scans are normalised as by `predict`: to the initial weights, to what this run has
-    trained before, or else to the sensor of the recipe.
+    A user's own scans are normalised as `predict` normalises them: to what the initial weights
+    expect, or else to what the weights of an earlier call in `out` expect, or else to the sensor
+    of the recipe.
 
     Raises:
-        InputError: as `open_dataset`.
+        InputError: if the dataset cannot be opened (`open_dataset`).
     """
     dataset = open_dataset(data)
     weights = Weights(recipe.model, dataset.taxonomy, recipe.sensor)
@@ -192,7 +198,7 @@ def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None
 def open_parts(
     specs: Sequence[str], recipe: Recipe, out: Path, init: Weights | None
 ) -> tuple[Dataset, list[TrainingScans]]:
-    """Open the datasets of a training: the first, and the others to mix in."""
+    """Open the datasets of a training: the first one, and the scans of the others to mix in."""
     first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
     parts = []
     for dataset in others:
@@ -201,7 +207,7 @@ def open_parts(
 
 
 def _earlier_weights(out: Path) -> Weights | None:
-    """Return weights that an earlier call has written into the folder; None without any."""
+    """Return the weights that an earlier call has written into the folder, or None."""
     for name in ("weights", "rv/last", "bev/last"):
         path = out / f"{name}.safetensors"
         if path.is_file():

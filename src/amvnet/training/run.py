@@ -35,12 +35,19 @@ from amvnet.weights.parts import deepened, fits, for_classes, replace_part, resi
 def train(
     plan: Plan, stage: StageName | Literal["all"] = "all", init: Weights | None = None
 ) -> Path:
-    """Train one stage, or all; return the weights file, with all parts trained so far.
+    """Train one stage, or all stages, and return the path of the weights file.
+
+    The file holds all parts that have been trained so far.
+
+    Args:
+        plan: the scans, the folder and the recipe of the run.
+        stage: the stage to train, or "all".
+        init: the weights to begin with.
 
     Raises:
-        InputError: if the head is to be trained without trained networks, or the folder holds a
-            run that is not to be resumed or was begun with other settings, or the check of the
-            data (`check_data`) finds an error.
+        InputError: if the head is to be trained before the networks; if the folder holds a run
+            that was begun with other settings, or that is not to be resumed; or if the check of
+            the data (`check_data`) finds an error.
     """
     names = plan.recipe.stages if stage == "all" else (stage,)
     if plan.scores is not None and names != ("head",):
@@ -49,7 +56,7 @@ def train(
     check_folder(plan)
     plan = dataclasses.replace(plan, stages=tuple(names))
 
-    # Check all stages before anything is written, and before hours are spent on the first.
+    # Check all stages before anything is written, and before hours are spent on the first one.
     weights = _first_weights(plan, init, names)
     for name in names:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
@@ -60,7 +67,7 @@ def train(
         write_record(plan, stage, init)
     keep_counts(plan, counts)
 
-    # Save after each stage, so that one that fails does not lose the others.
+    # Save after each stage, so that a stage that fails does not lose the earlier ones.
     path = plan.out / WEIGHTS
     for name in names:
         weights = train_stage(plan, name, weights)
@@ -86,7 +93,7 @@ def _draw_curves(plan: Plan) -> None:
 
 
 def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
-    """Train one stage unless an earlier run has finished it; return weights with the new part.
+    """Train one stage, unless an earlier run has finished it. Return the weights with the new part.
 
     Raises:
         InputError: if the weights to begin with do not fit the recipe, or a scan is broken.
@@ -94,7 +101,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
     if plan.resume and is_finished(plan, name):
         return with_trained(plan, name, weights)
 
-    # The recipe decides the sizes of the part, whatever the weights have.
+    # The recipe decides the sizes of the part, whatever sizes the weights state.
     L.seed_everything(plan.recipe.training.seed, verbose=False)
     weights = resized(weights, PART_OF[name], plan.recipe.model)
     if name == "head":
@@ -111,7 +118,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
 
 
 def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> Weights:
-    """Return fresh weights with the parts of `init`, and of this folder's finished stages.
+    """Return new weights with the parts of `init`, and the parts that this folder has finished.
 
     If `init` has other classes, its parts are only taken for the stages to train.
     """
@@ -122,7 +129,7 @@ def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> 
             continue
         # A new kind of head can be trained on the networks of any weights.
         if name == "head" and name in trained and not fits(init, part, plan.recipe.model):
-            plan.report("head: new, as that of the initial weights has other sizes")
+            plan.report("head: new, because the head of the initial weights has other sizes")
             continue
         begin = _deepened(plan, init, part) if name in trained else init
         if init.taxonomy.classes == weights.taxonomy.classes:
@@ -140,14 +147,14 @@ def _deepened(plan: Plan, init: Weights, part: str) -> Weights:
     deeper = deepened(init, part, plan.recipe.model, plan.recipe.training.seed)
     if deeper is None:
         return init
-    plan.report(f"{part}: the initial weights with new residual blocks, which begin as skips")
+    plan.report(f"{part}: the initial weights, with new residual blocks that begin as skips")
     return deeper
 
 
 def _with_finished(plan: Plan, weights: Weights) -> Weights:
-    """Return the weights with the parts of this folder's finished stages.
+    """Return the weights with the parts that the finished stages of this folder have trained.
 
-    Another process may have finished some of them while this one trained.
+    Another process may have finished some stages while this process trained.
     """
     for name in _stages_of_folder(plan):
         if is_finished(plan, name):
@@ -157,17 +164,17 @@ def _with_finished(plan: Plan, weights: Weights) -> Weights:
 
 def _stages_of_folder(plan: Plan) -> Sequence[str]:
     """Return the names of the stages that the folder can hold."""
-    # A head for other models' scores is of no use to these networks.
+    # The networks of this folder cannot use a head that was trained on other models' scores.
     return list(PART_OF) if plan.scores is None else ["head"]
 
 
 def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
-    """Return initial weights whose last layers are new, for the classes of the dataset."""
+    """Return the initial weights with new last layers for the classes of the dataset."""
     taxonomy = plan.scans.dataset.taxonomy
     weights, new = for_classes(init, taxonomy, plan.recipe.training.seed)
     of_part = [name for name in new if name.startswith(f"{part}.")]
     plan.report(
-        f"{part}: for the classes of {taxonomy.name}, all layers of the initial weights "
-        f"({init.taxonomy.name}) but {', '.join(of_part)}, which are new"
+        f"{part}: the initial weights ({init.taxonomy.name}), with new layers for the classes of "
+        f"{taxonomy.name}: {', '.join(of_part)}"
     )
     return weights

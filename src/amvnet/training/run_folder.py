@@ -1,4 +1,4 @@
-"""What a run keeps in its folder: its recipe, its data, and how far each stage is."""
+"""Read and write the folder of a run: its recipe, its data, and the progress of each stage."""
 
 from __future__ import annotations
 
@@ -23,27 +23,32 @@ from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights, load
 from amvnet.weights.parts import SIZES, replace_part
 
-# The stages in order, and the part of the weights that each trains.
+# The stages in order, and the part of the weights that each of them trains.
 PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
-LAST = "last.ckpt"  # in a stage's folder: what --resume continues from
-DONE = "done"  # in a stage's folder: an empty file once the stage is finished
-SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
-RECORD = "run.yaml"  # in the folder of a run: what each call read
+
+# Names of files in the folder of a stage.
+LAST = "last.ckpt"  # the checkpoint that --resume continues from
+DONE = "done"  # an empty file, which exists if the stage is finished
+SETTINGS = "stage.yaml"  # the settings that the stage was begun with
+
+# Names of files in the folder of a run.
+RECORD = "run.yaml"  # the inputs of each call
 RECIPE = "recipe.yaml"
 WEIGHTS = "weights.safetensors"
 CURVES = "curves.png"
-COUNTS = "class_counts.npz"  # points of each class
-# Settings whose digests say nothing to people, in words.
+COUNTS = "class_counts.npz"  # the number of points of each class
+
+# What messages say about settings that are digests.
 SCANS_CHANGED = {
     "scans.train": "other scans to train on",
     "scans.val": "other scans to validate with",
 }
-MOST_CHANGES = 6  # settings that a message names
-PACKAGES = ("amvnet", "torch", "lightning", "numpy")
+MOST_CHANGES = 6  # the most changed settings that a message names
+PACKAGES = ("amvnet", "torch", "lightning", "numpy")  # the packages whose versions are recorded
 
 
 def is_run(out: Path) -> bool:
-    """Return whether a folder is that of a run."""
+    """Return whether a folder is the folder of a run."""
     if any((out / stage / SETTINGS).is_file() for stage in PART_OF):
         return True
     entries = _entries(out / RECORD).values()
@@ -51,10 +56,11 @@ def is_run(out: Path) -> bool:
 
 
 def check_folder(plan: Plan) -> None:
-    """Check that a run may write into its folder, which is new or that of an earlier run.
+    """Check that a run may write into its folder: the folder is new, or an earlier run made it.
 
     Raises:
-        InputError: if what the run would write is there without a run, or is an input.
+        InputError: if a file that the run would write exists in the folder of no run, or is an
+            input.
     """
     names = (RECIPE, WEIGHTS, COUNTS, CURVES, RECORD, *PART_OF)
     check_not_read([plan.out / name for name in names], plan.also_read)
@@ -63,8 +69,8 @@ def check_folder(plan: Plan) -> None:
     for name in names:
         if os.path.lexists(plan.out / name):
             raise InputError(
-                f"{plan.out}: expected a new folder or that of a run, found {name} without the "
-                f"{RECORD} of a run; give another folder"
+                f"{plan.out}: expected a new folder or the folder of a run, found {name} without "
+                f"{RECORD}; give another folder"
             )
 
 
@@ -74,13 +80,21 @@ def is_finished(plan: Plan, name: str) -> bool:
 
 
 def with_trained(plan: Plan, name: str, weights: Weights) -> Weights:
-    """Return weights with the best or last part of a stage, as the recipe says."""
+    """Return the weights with the part that a stage has trained: its best or last one.
+
+    The recipe decides which of the two is kept.
+    """
     path = plan.out / name / f"{plan.recipe.training.keep}.safetensors"
     return replace_part(weights, PART_OF[name], load(path))
 
 
 def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
-    """Write recipe.yaml, and in run.yaml an entry for a stage or "all"."""
+    """Write recipe.yaml, and the entry of this call into run.yaml.
+
+    Args:
+        stage: the name of the entry: a stage, or "all".
+        init: the weights that the call begins with.
+    """
     dataset = plan.scans.dataset
     entry: dict[str, Any] = {
         "versions": {name: version(name) for name in PACKAGES},
@@ -94,22 +108,22 @@ def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
     if plan.scores is not None:
         entry["scores"] = repr(plan.scores)
 
-    # The entries of earlier calls, for other stages, stay; the new one comes last.
+    # Entries of earlier calls for other stages stay. The new entry comes last.
     entries = _entries(plan.out / RECORD)
     entries.pop(stage, None)
     entries[stage] = entry
-    write_yaml(plan.out / RECORD, entries)  # first: it says that the other files are of a run
+    write_yaml(plan.out / RECORD, entries)  # first, because it marks the folder of a run
     write_yaml(plan.out / RECIPE, to_dict(plan.recipe))
 
 
 def write_yaml(path: Path, tree: dict[str, Any]) -> None:
-    """Write a YAML file, whole or not at all; its keys stay in their order."""
+    """Write a YAML file, whole or not at all, with its keys in their order."""
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
 
 
 def _entries(path: Path) -> dict[str, Any]:
-    """Return the entries of a YAML file of a run; none if it cannot be read."""
+    """Return the entries of a YAML file of a run, or an empty dictionary if it is unreadable."""
     try:
         entries = parse_yaml(path.read_text(), f"{path}: expected the record of a run")
     except (OSError, ValueError):
@@ -118,7 +132,7 @@ def _entries(path: Path) -> dict[str, Any]:
 
 
 def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
-    """Return what the trained weights of a stage depend on, for YAML.
+    """Return all settings that the trained weights of a stage depend on, as a tree for YAML.
 
     Paths are left out, so that the data may move to another folder before the stage is resumed.
     """
@@ -140,7 +154,12 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
 
 
 def stage_record(plan: Plan, settings: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of a stage's training that its weights carry."""
+    """Return the record of a stage's training, which is stored in its weights.
+
+    Args:
+        settings: the settings of the stage, as `stage_settings` returns them.
+        sensor: the record of the sensor, as `sensor_record` returns it.
+    """
     scans = plan.scans
     scores = {"scores": settings["scores"]} if "scores" in settings else {}
     return {
@@ -157,9 +176,10 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     """Check that a stage can begin in a folder, or be resumed there.
 
     Raises:
-        InputError: if the stage was begun before, and is not to be resumed or had other settings.
+        InputError: if the stage was begun before, and either is not to be resumed or had other
+            settings.
     """
-    # A finished stage may have lost its checkpoint, which is of no use any more.
+    # A finished stage does not need its checkpoint, so the file may be gone.
     if not any((folder / name).is_file() for name in (LAST, DONE)):
         return
     if not resume:
@@ -174,15 +194,16 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         more = f" and {others} more" if others > 0 else ""
         raise InputError(
             f"{folder}: expected the settings of the earlier run ({SETTINGS}), found "
-            f"{', '.join(changes[:MOST_CHANGES])}{more}; resume it with those, or train further "
+            f"{', '.join(changes[:MOST_CHANGES])}{more}; resume it with them, or train further "
             f"from its weights in another folder: --init {folder.parent} --out FOLDER"
         )
 
 
 def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[str]:
-    """Return what differs between the settings of a stage, as "training.rv.lr 0.1 instead of 0.2".
+    """Return the differences between the settings of a stage, a text for each.
 
-    Digests, which say nothing to people, are not shown: "other scans to train on".
+    A text reads "training.rv.lr 0.1 instead of 0.2". Digests mean nothing to people. If one has
+    changed, the text says what it stands for, such as "other scans to train on".
     """
     before = dict(flat(earlier))
     now = dict(flat(settings))
@@ -200,7 +221,7 @@ def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[
 
 
 def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
-    """Return the names of the sequences of some scans, sorted, each once."""
+    """Return the sorted names of the sequences of some scans, each once."""
     return sorted({record.sequence for record in records})
 
 

@@ -1,4 +1,4 @@
-"""What weights record of the sensor of their training scans."""
+"""Measure the sensor of the training scans, for the record in the weights."""
 
 from __future__ import annotations
 
@@ -24,20 +24,22 @@ from amvnet.sensors.intensity import (
 from amvnet.sensors.record import AS_IS, measure_sensor, normalised_record
 from amvnet.sensors.record import KEY as SENSOR
 
-SAMPLED_SCANS = 60  # to measure: enough for the mean height of simulated sensors
+SAMPLED_SCANS = 60  # most scans that are measured; enough for the mean height of simulated sensors
 
 
 def sensor_record(
     dataset: Dataset, records: Sequence[ScanRecord], intensity: TrainedIntensity | None = None
 ) -> dict[str, Any]:
-    """Return what weights record of the sensor, measured on some of their training scans.
+    """Return the record of the sensor in the weights, measured on some of their training scans.
 
-    These are the measures of `sensors.record`, and the mean quantiles of the intensities at
-    `sensors.intensity.PROBABILITIES`, empty if no scan has usable ones. Broken scans are left out:
-    the training names them.
+    It holds the measures of `sensors.record`, and the mean quantiles of the intensities at
+    `sensors.intensity.PROBABILITIES`. The quantiles are empty if no scan has usable intensities.
+    Broken scans are left out, because the training itself reports them.
 
     Args:
-        intensity: what the intensities of the scans are brought to.
+        dataset: the dataset that reads the scans.
+        records: the training scans.
+        intensity: the distribution to which the intensities of the scans are matched.
     """
     scans = []
     for sampled in evenly_spaced(records, SAMPLED_SCANS):
@@ -53,7 +55,7 @@ def sensor_record(
     is_known = mean == NO_INTENSITY or are_quantiles(mean)
     record: dict[str, Any] = {INTENSITY: mean if is_known else []}
 
-    # Normalised scans are as the weights will get them: record what they are normalised to.
+    # The weights will get scans that are normalised in the same way, so record the normalisation.
     first = dataset.dataset if isinstance(dataset, Joined) else dataset
     normalised = normalised_record(first) if isinstance(first, OwnScans) else {}
     record |= normalised or {SENSOR: {**measure_sensor(scans), AS_IS: True}}

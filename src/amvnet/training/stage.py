@@ -1,4 +1,4 @@
-"""A stage of a training: what all stages share, and how Lightning fits one."""
+"""The base class of all stages of a training, and the function that fits a stage by Lightning."""
 
 from __future__ import annotations
 
@@ -39,24 +39,32 @@ from amvnet.training.run_folder import LAST, is_finished
 from amvnet.training.sync_batch_norm import synchronise_batch_norms
 from amvnet.weights.file import Weights
 
-MOMENTUM_CYCLE = 0.1  # the one-cycle schedule lowers the momentum by this much
-LOGGED_EVERY = 10  # batches, of the loss
+MOMENTUM_CYCLE = 0.1  # decrease of the momentum at the peak of the one-cycle schedule
+LOGGED_EVERY = 10  # number of batches between two logged values of the loss
 
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 SINGLE: Final = "32-true"
 DOUBLE: Final = "64-true"
 MIXED: Final = "bf16-mixed"
 
-# The batches to learn from and to validate with; None if nothing is validated.
+# The loaders of the batches to learn from and to validate with. The second one is None if nothing
+# is validated.
 Loaders = tuple[DataLoader[Any], DataLoader[Any] | None]
 
 
 class Stage(L.LightningModule):
-    """The base of all stages: metrics of the validation, the one-cycle schedule."""
+    """The base class of all stages: it computes the metrics of the validation, and the schedule.
+
+    Args:
+        config: the values of the stage in the recipe.
+        taxonomy: the K classes.
+        processes: the processes that share the run.
+        report: a function that prints a line about what happens.
+    """
 
     name: str  # the value of --stage
     trained: nn.Module  # the part of the model that this stage trains
-    in_float32 = False  # whether to compute in float32 whatever precision the recipe names
+    in_float32 = False  # whether the stage ignores the precision of the recipe
 
     def __init__(
         self,
@@ -88,7 +96,10 @@ class Stage(L.LightningModule):
         """Raise InputError if an epoch had nothing to learn from, before its weights are kept."""
 
     def whole_matrix(self) -> np.ndarray:
-        """Return the (K + 1, K + 1) confusion matrix of the validation, summed over processes."""
+        """Return the (K + 1, K + 1) confusion matrix of the validation, summed over processes.
+
+        Every process must call this.
+        """
         return np.sum(self.processes.gather(self.matrix), axis=0)
 
     def on_validation_epoch_start(self) -> None:
@@ -106,13 +117,14 @@ class Stage(L.LightningModule):
     def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
         """Return an optimizer with the one-cycle schedule, as Lightning expects it.
 
-        The learning rate rises to its peak, may stay there and falls again, while the momentum does
-        the opposite.
+        The learning rate rises to its peak, may stay there, and falls again. The momentum does the
+        opposite.
 
         Args:
-            momentum: highest momentum of SGD, or highest first beta of AdamW.
+            optimizer: the optimizer, SGD or AdamW.
+            momentum: the highest momentum of SGD, or the highest first beta of AdamW.
         """
-        # The schedule needs two steps before its peak, more than a very short training has.
+        # The schedule needs two steps before its peak, but a very short training has fewer.
         least = math.ceil(2 / self.config.warmup)
         steps = max(int(self.trainer.estimated_stepping_batches), least)
         held = int(getattr(self.config, "hold", 0) * steps)
@@ -146,7 +158,10 @@ class Stage(L.LightningModule):
 
 
 class KeepSignals(Callback):
-    """Leaves SIGTERM to the process: Lightning would end the training as if it were done."""
+    """Keeps this process's handler of SIGTERM.
+
+    Lightning's own handler would end the training as if it were done.
+    """
 
     def __init__(self) -> None:
         self._handler = signal.getsignal(signal.SIGTERM)
@@ -166,8 +181,11 @@ def fit(
     """Train a stage in its folder of the run, and write its weights after each epoch.
 
     Args:
-        weights: those that the training begins with.
-        intensity: what the intensities of the scans are brought to.
+        stage: the stage to train.
+        plan: the plan of the run.
+        loaders: the batches to learn from and to validate with.
+        weights: the weights that the training begins with.
+        intensity: the distribution to which the intensities of the scans are matched.
 
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
@@ -193,11 +211,11 @@ def fit(
         # Lightning sets the sampler's epoch only after the reading processes have begun to draw.
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
 
-    # Synchronised batch norms have the same statistics everywhere, and processes may validate
-    # unequal shares.
+    # Buffers need no broadcast, because synchronised batch norms have the same statistics in all
+    # processes. A broadcast would even block, because processes may validate unequal shares.
     ddp = DDPStrategy(broadcast_buffers=False)
     trainer = L.Trainer(
-        # Lightning's own way to double precision does not convert our batches.
+        # Lightning's double precision does not convert our batches, so `stage.double()` does it.
         precision=SINGLE if precision == DOUBLE else precision,
         accelerator=plan.recipe.training.accelerator,
         devices=plan.processes.size // plan.processes.nodes,  # on each machine
@@ -228,7 +246,8 @@ def fit(
 def _callbacks(stage: Stage, plan: Plan, keep_weights: KeepWeights) -> list[Callback]:
     """Return the callbacks of a stage.
 
-    Weights are written before the checkpoint, which never claims more than has been written.
+    The weights are written before the checkpoint, so that a checkpoint never claims an epoch whose
+    weights are not on disk.
     """
     has_bar = plan.bars and plan.processes.first
     lines = EpochLines(plan.report, stage.name, _epochs_after(stage, plan))
@@ -252,9 +271,10 @@ def _callbacks(stage: Stage, plan: Plan, keep_weights: KeepWeights) -> list[Call
 
 
 def _epochs_after(stage: Stage, plan: Plan) -> int:
-    """Return about how many epochs of this stage the later stages of the call take.
+    """Estimate how long the later stages of the call take, in epochs of this stage.
 
-    The head's epochs take no time; what takes it is scoring the scans, once or for each view.
+    The epochs of the head take hardly any time. Before them, all scans are scored once for each
+    view, and each scoring counts as an epoch.
     """
     if stage.name not in plan.stages:
         return 0
@@ -269,8 +289,8 @@ def _epochs_after(stage: Stage, plan: Plan) -> int:
 def precision_of(training: TrainingConfig) -> Precision:
     """Return the precision of a training, as Lightning names it.
 
-    `auto` is bf16-mixed on a device with bfloat16 arithmetic and 32-true on others, which only
-    emulate it, several times slower.
+    `auto` is bf16-mixed on a device with bfloat16 arithmetic, and 32-true on others. They only
+    emulate bfloat16, which takes several times as long.
 
     Raises:
         InputError: if this machine does not have the training's accelerator.
@@ -290,7 +310,7 @@ def _multiplies_bfloat16(device: str) -> bool:
 
 
 def _epochs_done(checkpoint: Path) -> int:
-    """Return how many epochs a checkpoint has behind it; raise InputError if it is broken."""
+    """Return the number of epochs before a checkpoint; raise InputError if the file is broken."""
     try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
         return state["epoch"] + 1

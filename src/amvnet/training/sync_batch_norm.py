@@ -11,9 +11,12 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 
 def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
-    """Replace the batch norms inside a network by ones with statistics over all processes.
+    """Replace the batch norms inside a network by batch norms over the batches of all processes.
 
-    PyTorch's own ones run on GPUs only (`cuda`). The network is changed in place and returned.
+    The network is changed in place and returned.
+
+    Args:
+        cuda: whether to use PyTorch's `SyncBatchNorm`, which runs on GPUs only.
     """
     if cuda:
         return nn.SyncBatchNorm.convert_sync_batchnorm(net)
@@ -27,11 +30,11 @@ def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
 
 
 class SyncedBatchNorm(_BatchNorm):
-    """Batch norm over the batches of all processes, which may differ in size."""
+    """Batch norm over the batches of all processes. The batches may differ in size."""
 
     @classmethod
     def of(cls, norm: _BatchNorm) -> SyncedBatchNorm:
-        """Return a batch norm over all processes, with the state of another one."""
+        """Return a batch norm over all processes that has the state of another batch norm."""
         weight = norm.weight
         synced = cls(
             norm.num_features, norm.eps, norm.momentum, device=weight.device, dtype=weight.dtype
@@ -45,10 +48,10 @@ class SyncedBatchNorm(_BatchNorm):
             return super().forward(input)
 
         x = input.to(torch.promote_types(input.dtype, torch.float32))
-        shape = (1, -1, *[1] * (x.ndim - 2))  # in which one value per channel broadcasts
-        axes = (0, *range(2, x.ndim))  # all but the channels
+        shape = (1, -1, *[1] * (x.ndim - 2))  # the shape in which a value per channel broadcasts
+        axes = (0, *range(2, x.ndim))  # all axes except the channels
 
-        # One exchange for two things: the sums of the channels, and the number of their values.
+        # One exchange serves both the sums of the channels and the number of their values.
         count = x.new_tensor([x.numel() / x.shape[1]])
         sums = _sum_over_processes(torch.cat([x.sum(axes), count]))
         mean = sums[:-1] / sums[-1]
@@ -77,7 +80,7 @@ class SyncedBatchNorm(_BatchNorm):
 
 
 class _ProcessSum(torch.autograd.Function):
-    """The sum over all processes; its gradient is the sum of their gradients."""
+    """The sum of a tensor over all processes. Its gradient is the sum of their gradients."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
