@@ -46,13 +46,13 @@ WARM_UP = 2
 
 
 def without_folding() -> None:
-    amvnet.engines.base.freeze = lambda module: None
+    amvnet.engines.base.freeze = lambda module: None  # type: ignore[attr-defined]
 
 
 def without_convolved_rows() -> None:
     # Nobody names the first parameter, `x`, which torch calls `input`.
     amvnet.models.layers.linear = F.linear  # type: ignore[assignment]
-    amvnet.models.polar_net.linear = F.linear  # type: ignore[assignment]
+    amvnet.models.polar_net.linear = F.linear  # type: ignore[attr-defined, assignment]
 
 
 def without_pykdtree() -> None:
@@ -79,8 +79,8 @@ def without_joining() -> None:
     def apply_to_joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
         return block(torch.cat([upsample(coarse, fine), fine], dim=1))
 
-    amvnet.models.polar_net.apply_to_joined = apply_to_joined
-    amvnet.models.range_net.apply_to_joined = apply_to_joined
+    amvnet.models.polar_net.apply_to_joined = apply_to_joined  # type: ignore[attr-defined]
+    amvnet.models.range_net.apply_to_joined = apply_to_joined  # type: ignore[attr-defined]
 
 
 def without_sharing() -> None:

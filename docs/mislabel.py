@@ -4,13 +4,18 @@ python mislabel.py DATA WRONG SEED [alike]     writes WRONG, a copy with wrong l
 python mislabel.py WRONG RANKING.csv           prints the share found in the first rows
 """
 
+from __future__ import annotations
+
 import csv
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from amvnet import Scan
+from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.labels.ids import write_ids
 from amvnet.ranking.clusters import cluster
@@ -21,7 +26,7 @@ MIN_POINTS = 10  # of a thing
 ALIKE = [(1, 2, 3, 4, 5), (6, 7, 8), (9, 10, 11, 12, 17), (13, 14), (15, 16, 18, 19)]
 
 
-def mislabel(data, wrong, seed, alike):
+def mislabel(data: str, wrong: str, seed: int, alike: bool) -> None:
     """Write a copy of a dataset with wrong labels, and which points they belong to."""
     shutil.copytree(data, wrong)
     dataset = open_dataset(data)
@@ -31,14 +36,16 @@ def mislabel(data, wrong, seed, alike):
     rng = np.random.default_rng(seed)
 
     things = list_things(dataset, records)
-    marks = {}
+    marks: dict[str, Any] = {}
     for number in rng.permutation(len(things))[: round(SHARE * len(things))]:
         index, thing = things[number]
         scan = dataset.read(records[index])
+        labels = copy.read(copied_records[index]).labels
+        assert scan.labels is not None
+        assert labels is not None
+
         points = connected(scan) == thing
         label = scan.labels[points][0]
-
-        labels = copy.read(copied_records[index]).labels
         labels[points] = rng.choice(other_classes(label, alike, dataset.taxonomy.size))
         raw = dataset.taxonomy.to_raw(labels)
         write_ids(copied_records[index].labels_path, raw)
@@ -47,11 +54,12 @@ def mislabel(data, wrong, seed, alike):
     np.savez(Path(wrong, "wrong.npz"), things=len(things), **marks)
 
 
-def list_things(dataset, records):
+def list_things(dataset: Dataset, records: list[ScanRecord]) -> list[tuple[int, int]]:
     """Return (index of the scan, thing) for all labelled things with enough points."""
     things = []
     for index, record in enumerate(records):
         scan = dataset.read(record)
+        assert scan.labels is not None
         of_thing, first = np.unique(connected(scan), return_index=True)
         sizes = np.bincount(connected(scan))
         for thing in of_thing[(sizes >= MIN_POINTS) & (scan.labels[first] > 0)]:
@@ -59,20 +67,21 @@ def list_things(dataset, records):
     return things
 
 
-def connected(scan):
+def connected(scan: Scan) -> np.ndarray:
     """Return (N,) the connected thing of one class that each point is part of."""
+    assert scan.labels is not None
     return cluster(scan.points[:, :3], scan.labels)
 
 
-def other_classes(label, alike, count):
+def other_classes(label: int, alike: bool, count: int) -> list[int]:
     """Return the classes that a label can be replaced by."""
-    classes = range(1, count + 1)
+    classes = tuple(range(1, count + 1))
     if alike:
         classes = next(group for group in ALIKE if label in group)
     return [other for other in classes if other != label]
 
 
-def score(wrong, ranking):
+def score(wrong: str, ranking: str) -> None:
     """Print how many of the wrong things are in the first rows of a ranking."""
     with np.load(Path(wrong, "wrong.npz")) as file:
         marks = dict(file)

@@ -164,6 +164,7 @@ def draw(
     distance = distance[shown]
     labels = merged(taxonomy)[result.labels]
     truth = scan.labels
+    assert truth is not None
     compared = scan.valid & (truth > 0)
     wrong = compared & (labels != truth)
     error = wrong.sum() / compared.sum()
@@ -226,7 +227,7 @@ def draw_legend(pen: ImageDraw.ImageDraw, taxonomy: Any, present: np.ndarray, to
 
 def legend_rows(present: np.ndarray) -> int:
     """Return the number of rows of the legend, in which the names do not overlap."""
-    return -(-np.count_nonzero(present) // MOST_COLUMNS)
+    return -(-int(np.count_nonzero(present)) // MOST_COLUMNS)
 
 
 def reduced(sheet: Image.Image, taxonomy: Any) -> Image.Image:

@@ -13,7 +13,7 @@ from amvnet.data.datasets.open import open_dataset
 SIZE = (40, 20, 10)  # cells of height, distance and intensity
 
 
-def cells(points):
+def cells(points: np.ndarray) -> np.ndarray:
     """Return (N,) the index of the cell that each of (N, 4) points is in."""
     height = (points[:, 2] + 3) / 8
     distance = np.hypot(points[:, 0], points[:, 1]) / 60
@@ -28,6 +28,7 @@ city = open_dataset(data)
 counts = np.full((np.prod(SIZE), 20), 0.1)
 for record in city.records(["00", "01", "02", "03"]):
     scan = city.read(record)
+    assert scan.labels is not None
     np.add.at(counts, (cells(scan.points), scan.labels), 1)
 scores = counts[:, 1:] / counts[:, 1:].sum(axis=1, keepdims=True)  # column c is class c + 1
 

@@ -30,7 +30,7 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.listing import DatasetScan, FileReader, FileScan, InputScan
 from amvnet.inference.pipeline import OutputOptions, Pipeline
-from amvnet.inference.segmenter import Segmentation
+from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
 from amvnet.weights.file import save
 from lidarstreets.layouts import write_whole
@@ -405,7 +405,7 @@ def test_the_content_is_on_the_disk_before_the_name(
         return call
 
     for name in ("fsync", "replace"):
-        monkeypatch.setattr(files.os, name, record(name))
+        monkeypatch.setattr(os, name, record(name))
     with atomic_write(tmp_path / "a.txt") as part:
         part.write_text("a")
 

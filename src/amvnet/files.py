@@ -173,10 +173,14 @@ def fault_of_name(name: Path) -> str | None:
     return f"more than {LONGEST_NAME} bytes" if longest > LONGEST_NAME else None
 
 
-def checked_token(text: Any) -> str:
+def checked_token(text: object) -> str:
     """Return a token that becomes the name of a file; raise InputError if it is no plain name."""
-    is_name = isinstance(text, str) and text.isprintable() and text not in ("", ".", "..")
-    if not is_name or set(text) & set("/\\"):
+    if (
+        not isinstance(text, str)
+        or not text.isprintable()
+        or text in ("", ".", "..")
+        or set(text) & set("/\\")
+    ):
         raise InputError(
             "expected tokens without separators and control characters, "
             f"found {shown(text)}; correct the table"
@@ -247,7 +251,7 @@ class _BoundedLoader(yaml.SafeLoader):
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
-            alias = self.peek_event()
+            alias = self.peek_event()  # type: ignore[no-untyped-call]
             raise yaml.YAMLError(f"the alias *{alias.anchor[:50]}, write its value out")
         if self._depth == DEEPEST_YAML:
             raise yaml.YAMLError(f"more than {DEEPEST_YAML} levels")

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
@@ -327,15 +328,17 @@ def disagree(assertion: AssertionConfig, f: np.ndarray, g: np.ndarray) -> np.nda
     return uncertain
 
 
-def softmax(scores: np.ndarray) -> np.ndarray:
+def softmax(scores: NDArray[np.float32]) -> NDArray[np.float32]:
     """Turn logits (P, K) into probabilities."""
     powers = np.exp(scores - scores.max(axis=1, keepdims=True))
-    return powers / powers.sum(axis=1, keepdims=True)
+    probabilities: NDArray[np.float32] = powers / powers.sum(axis=1, keepdims=True)
+    return probabilities
 
 
-def _cells(share: np.ndarray, cells: int) -> np.ndarray:
+def _cells(share: NDArray[np.floating], cells: int) -> NDArray[np.int64]:
     """Return which of `cells` equal parts of [0, 1] holds a number; if outside, the nearest."""
-    return np.clip(np.floor(share * cells).astype(np.int64), 0, cells - 1)
+    nearest: NDArray[np.int64] = np.clip(np.floor(share * cells).astype(np.int64), 0, cells - 1)
+    return nearest
 
 
 def _check_rings(ring: np.ndarray | None, height: int) -> np.ndarray:
@@ -411,7 +414,7 @@ def _is_complete(graph: Any) -> bool:
 
 def read_graph(folder: Path, graph: Mapping[str, Any]) -> bytes:
     """Return the content of a graph's file; raise InputError if it is not the described one."""
-    path = folder / graph["file"]
+    path: Path = folder / graph["file"]
     if not path.is_file():
         raise InputError(f"{path}: expected a graph of amvnet export, found no file; export again")
     try:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amvnet.errors import InputError, shown
 
@@ -99,10 +100,11 @@ class Scan:
         return valid
 
 
-def at_origin(xyz: np.ndarray) -> np.ndarray:
+def at_origin(xyz: NDArray[np.floating]) -> NDArray[np.intp]:
     """Return the (M,) indices of the points at 0, 0, 0, given (N, 3 or more) coordinates."""
     on_axis = np.flatnonzero(xyz[:, 0] == 0)  # few: their other coordinates are looked at alone
-    return on_axis[(xyz[on_axis, 1] == 0) & (xyz[on_axis, 2] == 0)]
+    indices: NDArray[np.intp] = on_axis[(xyz[on_axis, 1] == 0) & (xyz[on_axis, 2] == 0)]
+    return indices
 
 
 def check_scan(scan: Scan) -> Scan:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 Option = TypeVar("Option")
 
@@ -19,8 +20,8 @@ def weighted_choice(rng: np.random.Generator, shares: Mapping[Option, float]) ->
 
 
 def patchy_normal(
-    rng: np.random.Generator, places: np.ndarray, patch: float, correlation: float
-) -> np.ndarray:
+    rng: np.random.Generator, places: NDArray[np.floating], patch: float, correlation: float
+) -> NDArray[np.float64]:
     """Draw one standard normal number for each place; the numbers are correlated within cubes.
 
     Args:
@@ -35,4 +36,5 @@ def patchy_normal(
     cubes = np.floor(places / patch + rng.random(3)).astype(np.int64)
     shared = rng.standard_normal(HASH_VALUES, np.float32)[cubes @ HASH_PRIMES % HASH_VALUES]
     own = rng.standard_normal(len(places), np.float32)
-    return np.sqrt(correlation) * shared + np.sqrt(1 - correlation) * own
+    normal: NDArray[np.float64] = np.sqrt(correlation) * shared + np.sqrt(1 - correlation) * own
+    return normal

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarstreets.errors import SimulationError
 from lidarstreets.materials import MOVING, Label
@@ -100,12 +101,13 @@ class SimulatedScan:
     pose: np.ndarray
     time: float
 
-    def semantickitti_ids(self) -> np.ndarray:
+    def semantickitti_ids(self) -> NDArray[np.uint32]:
         """Return the (N,) uint32 raw labels of SemanticKITTI, with instances."""
         table = np.arange(2**16, dtype=np.uint32)
         for label in Label:
             table[label] = label.raw
-        return table[self.labels & CLASS_MASK] | self.labels & ~CLASS_MASK
+        raw_ids: NDArray[np.uint32] = table[self.labels & CLASS_MASK] | self.labels & ~CLASS_MASK
+        return raw_ids
 
     def nuscenes_categories(self) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the (N,) uint8 index of each point's category, and the names of all categories.

@@ -8,7 +8,7 @@ from functools import lru_cache
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 Vector = tuple[float, float, float]
 
@@ -27,7 +27,7 @@ _BOX_FACES = np.array([
 
 def box(
     size: Vector, at: Vector = (0, 0, 0), top: tuple[float, float] = (1, 1), shift: float = 0
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Return the (12, 3, 3) triangles of a box.
 
     Args:
@@ -39,18 +39,20 @@ def box(
     corners = _BOX_CORNERS * np.array(size)
     corners[4:, :2] *= np.array(top)
     corners[4:, 0] += shift
-    return (corners + np.array(at))[_BOX_FACES]
+    triangles: NDArray[np.float64] = (corners + np.array(at))[_BOX_FACES]
+    return triangles
 
 
 def copies(
-    triangles: np.ndarray, x: ArrayLike = 0.0, y: ArrayLike = 0.0, z: ArrayLike = 0.0
-) -> np.ndarray:
+    triangles: NDArray[np.float64], x: ArrayLike = 0.0, y: ArrayLike = 0.0, z: ArrayLike = 0.0
+) -> NDArray[np.float64]:
     """Return one copy of (T, 3, 3) triangles for each offset (x, y, z) in metres.
 
     The offsets are broadcast against each other: `x=[0, 1], z=2` gives two copies, both 2 m up.
     """
     offsets = np.stack(np.broadcast_arrays(x, y, z), axis=-1)
-    return (triangles + offsets[..., None, None, :]).reshape(-1, 3, 3)
+    copied: NDArray[np.float64] = (triangles + offsets[..., None, None, :]).reshape(-1, 3, 3)
+    return copied
 
 
 def tube(
@@ -61,7 +63,7 @@ def tube(
     sides: int = 8,
     *,
     closed: bool = True,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Return the triangles of a round bar between two points.
 
     Args:
@@ -106,7 +108,7 @@ def tube(
 
 def prism(
     profile: Sequence[tuple[float, float]], width: float, top_width: float | None = None
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Return the (4 * n, 3, 3) triangles of a side view extruded along y.
 
     Args:
@@ -133,7 +135,7 @@ def prism(
     return np.concatenate([side, *ends])
 
 
-def loft(rings: np.ndarray) -> np.ndarray:
+def loft(rings: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (2 * n * k, 3, 3) triangles of the closed body through (n, k, 3) rings of corners.
 
     If the corners of each ring are counter-clockwise seen from the last ring, the corners of the
@@ -158,7 +160,7 @@ def planks(
     bottom: ArrayLike,
     top: ArrayLike,
     y: ArrayLike = 0.0,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Return the (2 * n, 3, 3) triangles of n upright rectangles that face along y.
 
     The arguments are in metres and are broadcast against each other. `x` is the middle of each
@@ -178,20 +180,22 @@ def planks(
     return quads(a, b, c, d)
 
 
-def turned(triangles: np.ndarray, yaw: float) -> np.ndarray:
+def turned(triangles: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
     """Return (T, 3, 3) triangles turned by `yaw` radians about the z axis."""
     cos = np.cos(yaw)
     sin = np.sin(yaw)
     rotation = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # transposed: corners are rows
-    return triangles @ rotation
+    rotated: NDArray[np.float64] = triangles @ rotation
+    return rotated
 
 
-def moved(triangles: np.ndarray, at: Vector, yaw: float = 0.0) -> np.ndarray:
+def moved(triangles: NDArray[np.float64], at: Vector, yaw: float = 0.0) -> NDArray[np.float64]:
     """Return (T, 3, 3) triangles turned by `yaw` radians about the z axis, then moved by `at`."""
-    return turned(triangles, yaw) + np.array(at)
+    shifted: NDArray[np.float64] = turned(triangles, yaw) + np.array(at)
+    return shifted
 
 
-def leaning(triangles: np.ndarray, x: float, y: float) -> np.ndarray:
+def leaning(triangles: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
     """Return (T, 3, 3) triangles moved by x and y metres for each metre above the ground."""
     offset = np.zeros_like(triangles)
     offset[..., 0] = x * triangles[..., 2]
@@ -199,7 +203,7 @@ def leaning(triangles: np.ndarray, x: float, y: float) -> np.ndarray:
     return triangles + offset
 
 
-def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.ndarray:
+def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> NDArray[np.float64]:
     """Return the (2 * sides, 3, 3) triangles of a flat ring in the x-z plane, such as a tyre.
 
     Args:
@@ -215,10 +219,13 @@ def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.nda
     inner = circle * (radius - thickness)
     next_outer = np.roll(outer, -1, axis=0)
     next_inner = np.roll(inner, -1, axis=0)
-    return quads(outer, next_outer, next_inner, inner) + np.array(at)
+    triangles: NDArray[np.float64] = quads(outer, next_outer, next_inner, inner) + np.array(at)
+    return triangles
 
 
-def quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+def quads(
+    a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], d: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the (2 * n, 3, 3) triangles of n quadrangles.
 
     `a`, `b`, `c` and `d` are the (n, 3) corners in the order around each quadrangle.
@@ -226,13 +233,15 @@ def quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndar
     return np.concatenate([_triangles(a, b, c), _triangles(a, c, d)])
 
 
-def _triangles(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+def _triangles(
+    a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return n triangles, (n, 3, 3), from their (n, 3) corners."""
     return np.stack([a, b, c], axis=1)
 
 
 @lru_cache(maxsize=4)
-def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+def _sphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
     """Return the corners (V, 3) and the faces (T, 3) of a unit sphere."""
     from trimesh.creation import icosphere
 
@@ -247,7 +256,7 @@ def hull(
     taper: float = 0,
     square: float = 1,
     fine: bool = True,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Return the (T, 3, 3) triangles of the bumpy, closed hull of a clump of leaves.
 
     The corners are counter-clockwise seen from outside.
@@ -267,4 +276,5 @@ def hull(
 
     shape = np.sign(corners) * np.abs(corners) ** square * swell[:, None]
     shape[:, :2] *= np.maximum(1 - taper * shape[:, 2:], 0.05)  # keep the tip from turning over
-    return (shape * np.array(radii) + np.array(centre))[faces]
+    triangles: NDArray[np.float64] = (shape * np.array(radii) + np.array(centre))[faces]
+    return triangles

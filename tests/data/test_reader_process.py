@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -85,7 +86,7 @@ def test_an_interruption_does_not_mix_up_replies(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(reader_process.json, "loads", interrupt)
+        patch.setattr(json, "loads", interrupt)
         with pytest.raises(KeyboardInterrupt):
             first.read()
     np.testing.assert_array_equal(second.read().to_scan().points, CLOUDS[1])

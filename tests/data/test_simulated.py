@@ -21,13 +21,12 @@ from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.laser_order import with_lasers
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.training.loaders import ScanSet, make_loader
-from lidarstreets import SimulatedScan, simulate
+from lidarstreets import SimulatedScan, drive_street, simulate
 
 from fixtures.commands import fails
 from fixtures.tiny import fake_drive
 
 BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
-REAL_DRIVE = simulated.drive_street
 
 
 @pytest.fixture(params=simulated.CLASSES_BY_SENSOR)
@@ -50,7 +49,7 @@ def test_a_scan_equals_that_of_the_files_of_a_simulation(
     sensor: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("embreex")
-    monkeypatch.setattr(simulated, "drive_street", REAL_DRIVE)
+    monkeypatch.setattr(simulated, "drive_street", drive_street)
     monkeypatch.setattr(simulated, "SCANS", 2)
     options: dict[str, Any] = {"sensor": sensor, "scans": 2, "seed": simulated.SEED}
     written = open_dataset(str(simulate(tmp_path / "files", first_sequence=12, **options)))

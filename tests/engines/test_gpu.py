@@ -26,8 +26,9 @@ from amvnet.engines.precision import InPrecision, choose_device, choose_precisio
 from amvnet.engines.streams import TwoStreams
 from amvnet.inference.journal import Entry, Journal
 from amvnet.inference.listing import ScanOptions
-from amvnet.inference.pipeline import READ_AHEAD, OutputOptions, Pipeline
+from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
+from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import LateFusion
 from amvnet.models.assertion import Disagreement

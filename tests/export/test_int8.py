@@ -67,7 +67,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(weights: Weights, scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Folders:
     folders = Folders(tmp_path_factory.mktemp("a") / "float32", tmp_path_factory.mktemp("b"))
-    quantise = onnx_export.quantise
+    quantise = int8_export.quantise
 
     def copy_and_quantise(folder: Path, *rest: Any) -> Any:
         shutil.copytree(folder, folders.float32)

@@ -249,7 +249,7 @@ def workers_of(driver: int) -> list[int]:
 def test_wrong_input_is_one_line_before_a_cluster_is_started(
     fleet: Path, bucket: Bucket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(on_ray.ray, "init", lambda **_: pytest.fail("Ray was started"))
+    monkeypatch.setattr(ray, "init", lambda **_: pytest.fail("Ray was started"))
     weights = f"--weights {fleet}/w.safetensors"
     for text, words in (
         (f"s3://fleet/none {weights} --out s3://fleet/x", ("s3://fleet/none",)),

@@ -14,6 +14,8 @@ import pytest
 import amvnet
 from amvnet.data.formats import find
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.detect import ending_of
+from amvnet.data.formats.registry import read_file
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.predict import ADVICE, report_certainty
@@ -203,8 +205,8 @@ def test_each_file_is_read_once_and_its_format_detected_once(
 
         return counted
 
-    monkeypatch.setattr(find, "read_file", count(find.read_file, "read"))
-    monkeypatch.setattr(find, "ending_of", count(find.ending_of, "detect"))
+    monkeypatch.setattr(find, "read_file", count(read_file, "read"))
+    monkeypatch.setattr(find, "ending_of", count(ending_of, "detect"))
     names = [f"{index}.bin" for index in range(MEASURED + 2)]
     (tmp_path / "scans").mkdir()
     for index, name in enumerate(names):

@@ -26,9 +26,10 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan, list_inputs
-from amvnet.inference.pipeline import READ_AHEAD, OutputOptions, Pipeline
+from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
-from amvnet.inference.segmenter import Segmentation
+from amvnet.inference.scan_stream import READ_AHEAD
+from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save

@@ -39,7 +39,8 @@ def nuscenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def table(folder: Path, name: str) -> list[dict[str, Any]]:
     """Return the rows of one of nuScenes' tables."""
-    return json.loads((folder / "v1.0-trainval" / f"{name}.json").read_text())
+    rows: list[dict[str, Any]] = json.loads((folder / f"v1.0-trainval/{name}.json").read_text())
+    return rows
 
 
 def test_two_processes_write_the_same_bytes_as_one(nuscenes: Path, tmp_path: Path) -> None:

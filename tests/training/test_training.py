@@ -34,7 +34,7 @@ from amvnet.training.callbacks import KeepWeights
 from amvnet.training.checking import check_data
 from amvnet.training.curves import Curves, draw_curves, read_curves
 from amvnet.training.head_points import PointGatherer
-from amvnet.training.networks import NetworkStage
+from amvnet.training.networks import NetworkStage, train_network
 from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights, load, save
 
@@ -534,7 +534,6 @@ def test_two_stages_trained_at_the_same_time_are_both_kept(
     """The other stage begins after this one and ends before it, as if by another process."""
     save(fresh_weights(), tmp_path / "start.safetensors")
     options = ["--init", tmp_path / "start.safetensors", "--training.rv.epochs", 1]
-    train_network = training_run.train_network
 
     def train_beside(plan: Plan, name: str, weights: Weights) -> None:
         monkeypatch.setattr(training_run, "train_network", train_network)
@@ -713,7 +712,6 @@ def test_the_handler_of_sigterm_during_a_training_is_that_of_the_process(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handlers: dict[str, Any] = {}
-    train_network = training_run.train_network
 
     def note(plan: Plan, name: str, weights: Weights) -> None:
         handlers["before"] = signal.getsignal(signal.SIGTERM)

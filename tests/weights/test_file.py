@@ -22,7 +22,7 @@ import amvnet.weights
 from amvnet.config.nested import to_dict
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.segmenter import Segmentation
+from amvnet.inference.segmentation import Segmentation
 from amvnet.weights.file import PARTS, Weights, load, save
 
 from fixtures.tiny import fresh_weights, street

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amvnet.data.formats.cloud import record_dtype
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, TYPES
@@ -56,10 +57,11 @@ class LabelledPoints:
     colors: np.ndarray
     uncertain: np.ndarray | None
 
-    def packed_colors(self) -> np.ndarray:
+    def packed_colors(self) -> NDArray[np.float32]:
         """Return (N,) little-endian float32 whose bits are the colours as PCL packs them."""
         red, green, blue = self.colors.astype(np.uint32).T
-        return (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+        packed: NDArray[np.float32] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+        return packed
 
 
 def encode_labels(

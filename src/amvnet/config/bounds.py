@@ -23,7 +23,7 @@ class Range:
     high: float = math.inf
     open: bool = False
 
-    def __contains__(self, value: Any) -> bool:
+    def __contains__(self, value: float) -> bool:
         if self.open:
             return self.low < value < self.high
         return self.low <= value <= self.high

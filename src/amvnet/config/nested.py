@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeVar, cast, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 DEEPEST = 20  # levels of dictionaries that are made flat
 
 
@@ -90,7 +93,7 @@ def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
         changes[key] = _convert(getattr(default, key), value, field_types[key], f"{where}: {key}")
 
     with errors_of(where):
-        return dataclasses.replace(cast(Any, default), **changes)
+        return dataclasses.replace(default, **changes)
 
 
 def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
@@ -98,7 +101,7 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
     wrong_type = InputError(
         f"{where}: expected a value like {default!r}, found {shown(value)}; correct the value"
     )
-    if dataclasses.is_dataclass(default):
+    if dataclasses.is_dataclass(default) and not isinstance(default, type):
         if not isinstance(value, Mapping):
             raise wrong_type
         return replace_values(default, value, where)

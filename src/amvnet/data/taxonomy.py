@@ -14,6 +14,7 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amvnet.config.bounds import check_text
 from amvnet.errors import InputError, one_line_errors, shown
@@ -105,7 +106,7 @@ class Taxonomy:
         return ("unlabelled", *self.classes)
 
     @cached_property
-    def train_ids_by_raw(self) -> np.ndarray:
+    def train_ids_by_raw(self) -> NDArray[np.int16]:
         """(65536,) int16 train ids by raw id; UNKNOWN if the taxonomy has no such raw id."""
         others = 0 if self.ignores_rest else UNKNOWN
         table = np.full(INSTANCE_MASK + 1, others, dtype=np.int16)
@@ -119,7 +120,7 @@ class Taxonomy:
                 table[raw_id] = train_id
         return table
 
-    def to_train(self, raw: np.ndarray) -> np.ndarray:
+    def to_train(self, raw: NDArray[np.integer]) -> NDArray[np.uint8]:
         """Return the train ids (N,) uint8 of raw ids (N,); only their lower 16 bits count.
 
         Raises:
@@ -143,9 +144,10 @@ class Taxonomy:
                 f"expected the raw ids of {self.name} "
                 f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; {advice}"
             )
-        return train_ids.astype(np.uint8)
+        checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
+        return checked
 
-    def to_raw(self, ids: np.ndarray) -> np.ndarray:
+    def to_raw(self, ids: NDArray[np.integer]) -> NDArray[np.uint32]:
         """Return the raw ids (N,) uint32 of train ids (N,); raise InputError if one is wrong."""
         ids = np.asarray(ids)
         if ids.size and (ids.min() < 0 or ids.max() > self.size):
@@ -154,7 +156,8 @@ class Taxonomy:
                 f"found {ids.min()}..{ids.max()}; give train ids of this taxonomy"
             )
 
-        return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
+        raw_ids: NDArray[np.uint32] = np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
+        return raw_ids
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON.

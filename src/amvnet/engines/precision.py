@@ -35,7 +35,8 @@ class InPrecision(nn.Module):
         # Autocast must not keep converted weights: a CUDA graph would use weights that were
         # converted before its capture. Each weight is used once, so nothing is lost.
         with tf32, torch.autocast(self.kind, dtype, enabled=is_lower, cache_enabled=False):
-            return self.net(view).float()
+            scores: Tensor = self.net(view)
+            return scores.float()
 
 
 def choose_device(name: str, engine: str = "torch") -> str:

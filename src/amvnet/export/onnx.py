@@ -284,7 +284,8 @@ def _polar_graphs(model: AMVNet, batch: PointBatch, classes: int) -> dict[str, G
     decoded = grid.at_pillars(net.unet(pillars))
 
     def by_voxel(scores: Tensor) -> Tensor:  # (M, Z * K) -> (M, Z, K)
-        return scores.unflatten(1, (-1, classes)).softmax(dim=2)
+        voxels: Tensor = scores.unflatten(1, (-1, classes))
+        return voxels.softmax(dim=2)
 
     return {
         "polar_points": Graph(

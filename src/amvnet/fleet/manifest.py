@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
+from numpy.typing import NDArray
 from pyarrow.fs import FileType
 
 from amvnet.data.datasets.open import is_dataset
@@ -37,7 +38,7 @@ class NameSet:
     def __len__(self) -> int:
         return len(self._digests)
 
-    def add(self, names: Sequence[str]) -> np.ndarray:
+    def add(self, names: Sequence[str]) -> NDArray[np.bool_]:
         """Add many names; return for each, (N,) bool, whether it is new."""
         digests = _digests(names)
         is_first = np.zeros(len(names), bool)
@@ -47,18 +48,17 @@ class NameSet:
         self._digests = np.sort(np.concatenate([self._digests, digests[is_new]]))
         return is_new
 
-    def has(self, names: Sequence[str]) -> np.ndarray:
+    def has(self, names: Sequence[str]) -> NDArray[np.bool_]:
         """Return for each name, (N,) bool, whether it is in the set."""
         return self._has(_digests(names))
 
-    def _has(self, digests: np.ndarray) -> np.ndarray:
+    def _has(self, digests: NDArray[np.uint64]) -> NDArray[np.bool_]:
         before = np.searchsorted(self._digests, digests)
         after = np.searchsorted(self._digests, digests, "right")
-        is_present: np.ndarray = after > before
-        return is_present
+        return after > before
 
 
-def _digests(names: Sequence[str]) -> np.ndarray:
+def _digests(names: Sequence[str]) -> NDArray[np.uint64]:
     """Return (N,) uint64 digests of names."""
     content = [blake2b(name.encode(errors="surrogatepass"), digest_size=8) for name in names]
     return np.frombuffer(b"".join(each.digest() for each in content), np.uint64)

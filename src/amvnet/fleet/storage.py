@@ -179,14 +179,17 @@ def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
     root = f"{scheme}://{bucket}"
     shown_root = without_secrets(root)
     with reaching(shown_root), suppress(pa.ArrowInvalid):  # not a scheme of pyarrow
-        return fs.FileSystem.from_uri(f"{root}{OPTIONS.get(scheme, '/')}")
+        uri = f"{root}{OPTIONS.get(scheme, '/')}"
+        opened: tuple[fs.FileSystem, str] = fs.FileSystem.from_uri(uri)
+        return opened
     try:
-        return fs.FileSystem.from_uri(f"fsspec+{root}")
+        opened = fs.FileSystem.from_uri(f"fsspec+{root}")
     except (ImportError, ValueError) as error:
         raise InputError(
             f"{shown_root}: expected a storage that can be opened, found {_reason_of(error)}; "
             "install its package, or use s3://, gs:// or file://"
         ) from None
+    return opened
 
 
 def _reason_of(error: BaseException) -> str:

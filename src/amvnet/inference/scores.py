@@ -10,6 +10,7 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import softmax
 
 from amvnet.data.datasets.base import ScanRecord
@@ -198,9 +199,10 @@ def are_probabilities(values: np.ndarray) -> np.ndarray:
     return is_one & (values >= 0).all(axis=1)
 
 
-def have_opinion(values: np.ndarray) -> np.ndarray:
+def have_opinion(values: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (P,) bool: whether each row of (P, K) probabilities prefers a class."""
-    return (values != values[:, :1]).any(axis=1)
+    is_opinion: NDArray[np.bool_] = (values != values[:, :1]).any(axis=1)
+    return is_opinion
 
 
 def check_logits(values: np.ndarray, name: str) -> None:

@@ -149,7 +149,8 @@ class Segmentation:
     @property
     def confidence(self) -> NDArray[np.float32]:
         """(N,) probability of each point's label, in [0, 1]; 0 for points that are not valid."""
-        return self.probabilities.max(axis=1, initial=0)
+        largest: NDArray[np.float32] = self.probabilities.max(axis=1, initial=0)
+        return largest
 
     @property
     def class_names(self) -> tuple[str, ...]:

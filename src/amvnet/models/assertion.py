@@ -35,5 +35,5 @@ class Disagreement:
 def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
     """Return the cosine similarity (P,) of class probabilities f and g (P, K)."""
     lengths = f.norm(dim=1) * g.norm(dim=1)
-    similarity = torch.linalg.vecdot(f, g) / lengths.clamp_min(TINY)
+    similarity: Tensor = torch.linalg.vecdot(f, g) / lengths.clamp_min(TINY)
     return similarity.clamp_max(1)  # rounding must not put a point beyond tau = 1

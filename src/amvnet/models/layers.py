@@ -42,7 +42,11 @@ def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
     if not left and not right:
         return x
 
-    return _WrapWidth.apply(x, left, right) if x.requires_grad else _pad_width(x, left, right)
+    if not x.requires_grad:
+        return _pad_width(x, left, right)
+
+    wrapped: Tensor = _WrapWidth.apply(x, left, right)  # type: ignore[no-untyped-call]
+    return wrapped
 
 
 def _pad_width(x: Tensor, left: int, right: int) -> Tensor:
@@ -158,6 +162,7 @@ class AzimuthGRU(nn.Module):
 
         # bfloat16 is too coarse for the hidden state: the recurrence would lose it.
         with torch.autocast(x.device.type, enabled=False):
+            outputs: Tensor
             outputs, _ = self.gru(columns.reshape(b, -1, c).to(next(self.gru.parameters()).dtype))
         return outputs.view(b, -1, h, c)[:, padding:].permute(0, 3, 2, 1)  # (B, C, H, W)
 

@@ -100,7 +100,7 @@ class PointHead(nn.Module):
 
     def _logits(self, pooled: Tensor, point: Tensor) -> Tensor:
         """Return the logits (U, K), given the pooled neighbours (U, C) and p_i (U, 2 K + 4)."""
-        logits = self.fc(torch.cat([pooled, point], dim=1))
+        logits: Tensor = self.fc(torch.cat([pooled, point], dim=1))
         share = self.config.share
         if share == 1 or self.training:
             return logits

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import Taxonomy, check_classes
@@ -199,21 +200,25 @@ def find_clusters(doubts: PointDoubts) -> np.ndarray:
     return rows
 
 
-def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+def _middle_points(
+    xyz: NDArray[np.floating], group: NDArray[np.intp], sizes: NDArray[np.intp]
+) -> NDArray[np.intp]:
     """Return the index of the point nearest to the mean in each group."""
     mean = np.stack([np.bincount(group, axis) / sizes for axis in xyz.T], axis=1)
     squared_distance = ((xyz - mean[group]) ** 2).sum(axis=1)
     order = np.lexsort((squared_distance, group))
     group_starts = np.cumsum(sizes) - sizes
 
-    return order[group_starts]
+    nearest: NDArray[np.intp] = order[group_starts]
+    return nearest
 
 
-def _most_common(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+def _most_common(ids: NDArray[np.integer], group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """Return the most common id in each of `count` groups; the lowest if several are."""
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
-    return table.argmax(axis=1)
+    most_common: NDArray[np.intp] = table.argmax(axis=1)
+    return most_common
 
 
 def write_clusters(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 MIN_DISTANCE = 1.0  # metres; nearer returns are from the vehicle itself
 CELL = 1.0  # side of the cells whose lowest points are used, metres
@@ -42,7 +43,7 @@ class Ground:
         is_sure: whether the plane is sure enough to turn the scan by it.
     """
 
-    up: np.ndarray
+    up: NDArray[np.floating]
     height: float
     is_sure: bool
 
@@ -52,7 +53,7 @@ class Ground:
         return float(np.degrees(np.arccos(np.clip(self.up[2], -1, 1))))
 
 
-def find_ground(xyz: np.ndarray) -> Ground | None:
+def find_ground(xyz: NDArray[np.floating]) -> Ground | None:
     """Find the ground of a scan whose z axis points more or less up; None if there is none.
 
     Of many planes through three low points, the ground is the plane with many low points in it and
@@ -102,7 +103,7 @@ def find_ground(xyz: np.ndarray) -> Ground | None:
     return Ground(normal / np.linalg.norm(normal), height, is_sure)
 
 
-def _sides(xyz: np.ndarray, plane: np.ndarray) -> tuple[float, float]:
+def _sides(xyz: NDArray[np.floating], plane: NDArray[np.floating]) -> tuple[float, float]:
     """Return the share of the points (N, 3) that are clearly above a plane, and clearly below it.
 
     Far points count as well: next to a raised road, more near points may be below it than above.
@@ -112,17 +113,20 @@ def _sides(xyz: np.ndarray, plane: np.ndarray) -> tuple[float, float]:
     return float(np.mean(off_plane > least)), float(np.mean(off_plane < -least))
 
 
-def _lowest_points(xyz: np.ndarray) -> np.ndarray:
+def _lowest_points(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the lowest point of each cell around the sensor, (M, 3)."""
     column, row = np.floor((xyz[:, :2] + RADIUS) / CELL).astype(np.int64).T
     cell = column * int(2 * RADIUS / CELL + 1) + row
 
     order = np.lexsort((xyz[:, 2], cell))
     is_first = np.diff(cell[order], prepend=-1) > 0
-    return xyz[order][is_first]
+    lowest: NDArray[np.floating] = xyz[order][is_first]
+    return lowest
 
 
-def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
+def _best_plane(
+    low: NDArray[np.floating], weight: NDArray[np.floating]
+) -> NDArray[np.floating] | None:
     """Return (a, b, c) of the plane z = a x + b y + c that most low points (M, 3) agree with.
 
     Return None if every plane is too steep. The random draws are seeded, so that the same points
@@ -142,9 +146,10 @@ def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
     above = low[:, 2] - planes @ _with_ones(low).T  # (planes, M) metres
     agreeing = (np.abs(above) < TOLERANCE) @ weight
     below = (above < -3 * TOLERANCE) @ weight
-    return planes[(agreeing - below).argmax()]
+    best: NDArray[np.floating] = planes[(agreeing - below).argmax()]
+    return best
 
 
-def _with_ones(xyz: np.ndarray) -> np.ndarray:
+def _with_ones(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return rows x, y, 1, (M, 3). Their product with (a, b, c) is the height of the plane."""
     return np.column_stack([xyz[:, :2], np.ones(len(xyz))])

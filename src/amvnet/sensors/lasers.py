@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amvnet.sensors.ground import MIN_DISTANCE, find_ground
 from amvnet.sensors.lidars import Sensor
@@ -114,6 +115,9 @@ def measure_lasers(points: np.ndarray, ring: np.ndarray | None = None) -> Sensor
     return SensorGeometry(beams, float(up), float(down))
 
 
-def elevations(xyz: np.ndarray) -> np.ndarray:
+def elevations(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the (N,) elevations of (N, 3) points, degrees above the horizon."""
-    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+    degrees: NDArray[np.floating] = np.degrees(
+        np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
+    )
+    return degrees

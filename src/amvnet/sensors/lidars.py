@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
 from amvnet.files import read_yaml
@@ -95,12 +96,12 @@ class Sensor:
             raise InputError(f"{key}: expected {expected}, found {found}; correct the value")
 
     @property
-    def turn(self) -> np.ndarray:
+    def turn(self) -> NDArray[np.float64]:
         """The (3, 3) rotation from the file's axes to the package's: x forward, y left, z up."""
         axes = np.array(AXES[self.axes or "x-forward"], dtype=np.float64)
         return axes if self.rotate is None else rotation_from_degrees(*self.rotate) @ axes
 
-    def to_level(self, xyz: np.ndarray) -> np.ndarray:
+    def to_level(self, xyz: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return the points (N, 3) of a file in metres and in the package's axes.
 
         Unknown values change nothing. If the points are scaled, turned or moved, the result is
@@ -114,7 +115,7 @@ class Sensor:
 
         # Numbers that become too large are infinite; then their points are invalid.
         with np.errstate(over="ignore", invalid="ignore"):
-            level = xyz.astype(np.float64) * scale @ turn.T + offset
+            level: NDArray[np.floating] = xyz.astype(np.float64) * scale @ turn.T + offset
         level[(xyz == 0).all(axis=1)] = np.nan
         return level
 
@@ -131,7 +132,7 @@ def _is_triple(values: Any) -> bool:
     return isinstance(values, tuple) and len(values) == 3 and all(map(math.isfinite, values))
 
 
-def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> np.ndarray:
+def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
     """Return the (3, 3) rotation by roll about x, then pitch about y, then yaw about z."""
     angles = np.radians([yaw, pitch, roll])
     cos_yaw, cos_pitch, cos_roll = np.cos(angles)
@@ -140,7 +141,8 @@ def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> np.ndarray:
     about_z = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
     about_y = np.array([[cos_pitch, 0, sin_pitch], [0, 1, 0], [-sin_pitch, 0, cos_pitch]])
     about_x = np.array([[1, 0, 0], [0, cos_roll, -sin_roll], [0, sin_roll, cos_roll]])
-    return about_z @ about_y @ about_x
+    rotation: NDArray[np.float64] = about_z @ about_y @ about_x
+    return rotation
 
 
 _SHEETS = tomllib.loads((files("amvnet.sensors") / "lidars.toml").read_text(encoding="utf-8"))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from amvnet.config.schema import AugmentConfig
@@ -192,7 +193,8 @@ def lasers(scan: Scan) -> np.ndarray:
     elevation = np.nan_to_num(_elevations(scan))
     lowest, highest = _spread(elevation)
     borders = np.linspace(lowest, highest, ELEVATION_BINS + 1)[1:-1]
-    return np.searchsorted(borders, elevation, side="right")
+    laser: NDArray[np.intp] = np.searchsorted(borders, elevation, side="right")
+    return laser
 
 
 def _drop_points(scan: Scan, largest_share: float, rng: np.random.Generator) -> Scan:
@@ -253,24 +255,27 @@ def _distort_intensity(
     return intensity
 
 
-def _in_sector(scan: Scan, start: float, width: float) -> np.ndarray:
+def _in_sector(scan: Scan, start: float, width: float) -> NDArray[np.bool_]:
     """Return (N,) bool: whether a point's azimuth is at most `width` radians beyond `start`."""
     azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
-    return (azimuth - start) % (2 * np.pi) < width
+    is_inside: NDArray[np.bool_] = (azimuth - start) % (2 * np.pi) < width
+    return is_inside
 
 
-def _elevations(scan: Scan) -> np.ndarray:
+def _elevations(scan: Scan) -> NDArray[np.floating]:
     """Return (N,) angles above the horizon, radians."""
     x, y, z = scan.points[:, :3].T
-    return np.arctan2(z, np.hypot(x, y))
+    elevation: NDArray[np.floating] = np.arctan2(z, np.hypot(x, y))
+    return elevation
 
 
-def _spread(values: np.ndarray) -> np.ndarray:
+def _spread(values: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the lowest and the highest value without `OUTLIERS`, or zeros if none is finite."""
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
         return np.zeros(2)
-    return np.percentile(finite, [OUTLIERS, 100 - OUTLIERS])
+    ends: NDArray[np.floating] = np.percentile(finite, [OUTLIERS, 100 - OUTLIERS])
+    return ends
 
 
 def _keep(scan: Scan, mask: np.ndarray) -> Scan:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
@@ -70,10 +71,11 @@ class HeadStage(Stage):
         counts = np.bincount(cells, stands_for.cpu().numpy(), size**2)
         self.matrix += counts.reshape(size, size)
 
-    def whole_matrix(self) -> np.ndarray:
+    def whole_matrix(self) -> NDArray[np.float64]:
         """Return AMVNet's confusion matrix: the head's, plus the ensemble's for certain points."""
         assert self.val_points is not None
-        return super().whole_matrix() + self.val_points.certain
+        total: NDArray[np.float64] = super().whole_matrix() + self.val_points.certain
+        return total
 
     def on_validation_epoch_end(self) -> None:
         super().on_validation_epoch_end()

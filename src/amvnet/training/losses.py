@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -23,7 +24,7 @@ FREQUENCY_FLOOR = 1e-4
 MIN_ERROR = 1e-3
 
 
-def class_weights(counts: np.ndarray) -> np.ndarray:
+def class_weights(counts: NDArray[np.number]) -> NDArray[np.float32]:
     """Return the square roots of the inverse class frequencies, scaled to a mean of 1.
 
     Frequencies below `FREQUENCY_FLOOR` are raised to it; the frequency of an absent class is 0.
@@ -37,7 +38,8 @@ def class_weights(counts: np.ndarray) -> np.ndarray:
     """
     frequency = np.maximum(counts / max(counts.sum(), 1), FREQUENCY_FLOOR)
     weights = 1 / np.sqrt(frequency)
-    return (weights / weights.mean()).astype(np.float32)
+    scaled: NDArray[np.float32] = (weights / weights.mean()).astype(np.float32)
+    return scaled
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,8 @@ class NetworkStage(Stage):
         batch = parts * loader.batch_size
         before = index // parts * batch  # number of scans in the earlier steps
         in_step = min(batch, len(loader.sampler) - before)
-        return count * parts / in_step
+        weight: float = count * parts / in_step
+        return weight
 
     def configure_optimizers(self) -> Any:
         # On a GPU, a fused optimizer takes the whole step in one launch. With it, Lightning cannot

@@ -21,6 +21,7 @@ from lightning.pytorch.callbacks import (
 )
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.strategies import DDPStrategy
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
@@ -95,12 +96,13 @@ class Stage(L.LightningModule):
     def check_epoch(self) -> None:
         """Raise InputError if an epoch had nothing to learn from, before its weights are kept."""
 
-    def whole_matrix(self) -> np.ndarray:
+    def whole_matrix(self) -> NDArray[np.float64]:
         """Return the (K + 1, K + 1) confusion matrix of the validation, summed over processes.
 
         Every process must call this.
         """
-        return np.sum(self.processes.gather(self.matrix), axis=0)
+        total: NDArray[np.float64] = np.sum(self.processes.gather(self.matrix), axis=0)
+        return total
 
     def on_validation_epoch_start(self) -> None:
         self.matrix = self.empty_matrix()
@@ -302,7 +304,7 @@ def precision_of(training: TrainingConfig) -> Precision:
 
 def _multiplies_bfloat16(device: str) -> bool:
     if device == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     if device == "cpu" and hasattr(torch.cpu, "get_capabilities"):  # newer than torch 2.6
         capabilities = torch.cpu.get_capabilities()
         return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
@@ -313,7 +315,7 @@ def _epochs_done(checkpoint: Path) -> int:
     """Return the number of epochs before a checkpoint; raise InputError if the file is broken."""
     try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        return state["epoch"] + 1
+        return int(state["epoch"]) + 1
     except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError):
         raise InputError(
             f"{checkpoint}: expected a checkpoint, found a broken file; delete it to train again"

@@ -19,7 +19,8 @@ def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
         cuda: whether to use PyTorch's `SyncBatchNorm`, which runs on GPUs only.
     """
     if cuda:
-        return nn.SyncBatchNorm.convert_sync_batchnorm(net)
+        synchronised: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(net)
+        return synchronised
 
     for name, child in net.named_children():
         if isinstance(child, _BatchNorm):
@@ -94,4 +95,5 @@ class _ProcessSum(torch.autograd.Function):
 
 
 def _sum_over_processes(x: Tensor) -> Tensor:
-    return _ProcessSum.apply(x)
+    total: Tensor = _ProcessSum.apply(x)  # type: ignore[no-untyped-call]
+    return total

@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from lidarstreets.chance import patchy_normal
@@ -155,9 +156,10 @@ class Hits:
     shift: np.ndarray
 
     @property
-    def places(self) -> np.ndarray:
+    def places(self) -> NDArray[np.float32]:
         """The vectors from the origins of the rays to the surfaces: (N, 3), metres."""
-        return self.direction * self.distance[:, None]
+        places: NDArray[np.float32] = self.direction * self.distance[:, None]
+        return places
 
 
 @lru_cache(maxsize=4)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
 from lidarstreets.chance import patchy_normal
@@ -159,7 +160,8 @@ def _intensity(
 
     brightness *= lasers.gain[hits.ring]
     intensity = np.round(sensor.gain * brightness**sensor.gamma, sensor.decimals)
-    return np.clip(intensity, 0, 0.99)
+    clipped: NDArray[np.float64] = np.clip(intensity, 0, 0.99)
+    return clipped
 
 
 def _patchy(hits: Hits, rng: np.random.Generator) -> np.ndarray:
@@ -186,7 +188,8 @@ def _measured_distance(
     noise = rng.standard_normal(count, np.float32)
     height *= relief * np.exp(RELIEF_SPREAD * patchy_normal(rng, hits.places, *MEAN_RELIEF_PATCH))
     depth = height / np.maximum(hits.facing, MIN_COSINE)
-    return mixed + depth + sensor.range_noise * noise
+    measured: NDArray[np.float64] = mixed + depth + sensor.range_noise * noise
+    return measured
 
 
 def _mixed_distance(hits: Hits, sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:

@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarstreets.materials import GROUND_SURFACES, Label
 from lidarstreets.streets.places import Places
@@ -41,13 +42,16 @@ class GroundBrightness:
         # Random numbers for the repairs of the road and its manholes.
         self._cells = rng.random((CELL_PERIOD, CELL_PERIOD))
 
-    def terrain_tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
+    def terrain_tint(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], label: np.ndarray
+    ) -> NDArray[np.float64]:
         """Return the tints, without repairs, at the places x, y with the class ids `label`.
 
         All arrays are (N,); x and y are in metres.
         """
         pattern = np.sin(0.21 * x + 1.3 * np.sin(0.13 * y))
-        return self._tints[label] + 0.8 * pattern * np.sin(0.33 * y + 0.05 * x)
+        tint: NDArray[np.float64] = self._tints[label] + 0.8 * pattern * np.sin(0.33 * y + 0.05 * x)
+        return tint
 
     def repairs(self, along: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return what repairs and manholes add to the tints at street coordinates `along` and t.

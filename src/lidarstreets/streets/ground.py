@@ -1,6 +1,7 @@
 """Compute the height, the class and the brightness of the ground of a street at any place."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, part
@@ -120,7 +121,9 @@ class Ground(MiddleLine):
         y = np.asarray(y, dtype=float)
         return self._height(x, y, locate(self, self.plan, x, y))
 
-    def _height(self, x: np.ndarray, y: np.ndarray, places: Places) -> np.ndarray:
+    def _height(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], places: Places
+    ) -> NDArray[np.float64]:
         """Return the height of the ground at x, y; `places` says where these lie in the street."""
         style = self.style
         z = self._relief.hills(x, y)
@@ -153,7 +156,10 @@ class Ground(MiddleLine):
         right = width_of(style.strips[0])
         left = width_of(style.strips[1])
         pavement = right + (left - right) * np.clip(0.5 + places.t / 4, 0, 1)
-        return z + self._relief.beyond(places.kerb - pavement, places.t, places.x, x, y)
+        height: NDArray[np.float64] = z + self._relief.beyond(
+            places.kerb - pavement, places.t, places.x, x, y
+        )
+        return height
 
     def _profiles(self, places: Places) -> list[tuple[tuple[Strip, ...], np.ndarray]]:
         """Return the strips along each road, and which places are nearest to this road."""
@@ -257,6 +263,6 @@ class Ground(MiddleLine):
         z[near] = self.height(x[near], y[near])
 
 
-def _ramp(distance: np.ndarray) -> np.ndarray:
+def _ramp(distance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return 0 on the road, 1 behind the kerb, and a steep ramp over the kerb itself."""
     return np.clip((distance + KERB_RAMP) / (2 * KERB_RAMP), 0, 1)

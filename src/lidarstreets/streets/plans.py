@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarstreets.materials import Label
 from lidarstreets.streets.styles import Strip, Style, width_of
@@ -41,7 +42,9 @@ class SideRoad:
     corner: float = 4.0
     strips: tuple[Strip, ...] = ()
 
-    def coordinates(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def coordinates(
+        self, x: NDArray[np.float64], y: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the coordinates of places x, y on the road; all arrays have one shape.
 
         Returns:
@@ -59,7 +62,7 @@ class SideRoad:
             across = (across - middle) / np.sqrt(1 + tangent**2)
         return along, across
 
-    def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def distance(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distance of places x, y from the edge of the road; negative on the road."""
         along, across = self.coordinates(x, y)
         distance = np.maximum(np.abs(across) - self.width / 2, -along)

@@ -1,6 +1,7 @@
 """Draw the relief of the land that a street lies in."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarstreets.streets.styles import Style
 
@@ -31,14 +32,20 @@ class Relief:
         self._bumps = _stack_waves(amplitudes, wavelengths, direction, phase)
         self._modulation = rng.uniform(0, 2 * np.pi, size=4)
 
-    def hills(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def hills(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height of the hills, which roads follow, at the places x, y; metres."""
         z = self._slope[0] * x + self._slope[1] * np.clip(y, -60, 60)
-        return z + _waves(self._hills, x, y)
+        height: NDArray[np.float64] = z + _waves(self._hills, x, y)
+        return height
 
     def beyond(
-        self, off: np.ndarray, t: np.ndarray, along: np.ndarray, x: np.ndarray, y: np.ndarray
-    ) -> np.ndarray:
+        self,
+        off: NDArray[np.float64],
+        t: NDArray[np.float64],
+        along: NDArray[np.float64],
+        x: NDArray[np.float64],
+        y: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
         """Return the height of the land over the hills: banks, ditches and bumps; metres.
 
         Args:
@@ -63,19 +70,25 @@ class Relief:
         # Some places are smooth, others are rough.
         patchy = np.sin(0.11 * x + self._modulation[2]) * np.sin(0.13 * y + self._modulation[3])
         bumps = _waves(self._bumps, x, y) * (1 + 0.8 * patchy)
-        return z + np.clip(off / 1.5, 0, 1) * bumps
+        height: NDArray[np.float64] = z + np.clip(off / 1.5, 0, 1) * bumps
+        return height
 
 
 def _stack_waves(
-    amplitudes: np.ndarray, wavelengths: np.ndarray, direction: np.ndarray, phase: np.ndarray
-) -> np.ndarray:
+    amplitudes: NDArray[np.float64],
+    wavelengths: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    phase: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Return waves as rows of amplitude, wave vector (x, y) and phase: (W, 4)."""
     wave_x = 2 * np.pi / wavelengths * np.cos(direction)
     wave_y = 2 * np.pi / wavelengths * np.sin(direction)
     return np.column_stack([amplitudes, wave_x, wave_y, phase])
 
 
-def _waves(waves: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _waves(
+    waves: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the sum of (W, 4) waves at the places x, y; see `_stack_waves`."""
     z = np.zeros(np.shape(x))
     for amplitude, wave_x, wave_y, phase in waves:

@@ -34,7 +34,8 @@ MAKERS: dict[Maker, tuple[Label, Limits, Limits, Limits]] = {
 
 def size_of(mesh: Mesh) -> np.ndarray:
     corners = mesh.triangles.reshape(-1, 3)
-    return np.ptp(corners, axis=0)
+    size: np.ndarray = np.ptp(corners, axis=0)
+    return size
 
 
 @pytest.mark.parametrize("maker", MAKERS, ids=lambda maker: maker.__name__)

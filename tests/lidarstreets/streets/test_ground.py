@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lidarstreets.materials import Label
-from lidarstreets.streets.ground import RARELY_PARKED_SHARE, Ground, Patch
+from lidarstreets.streets.ground import RARELY_PARKED_SHARE, Ground
 from lidarstreets.streets.kinds import STREET_KINDS
-from lidarstreets.streets.plans import Island, SideRoad, rounded_union, strip_at
+from lidarstreets.streets.plans import Island, Patch, SideRoad, rounded_union, strip_at
 from lidarstreets.streets.styles import Strip, draw_style
 
 LENGTH = 240.0

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import check_usable, ring_indices
@@ -252,7 +253,7 @@ class NuScenes(Dataset):
             table[row["index"]] = train_id
         return table
 
-    def _categories_to_train(self, indices: np.ndarray, path: Path) -> np.ndarray:
+    def _categories_to_train(self, indices: NDArray[np.integer], path: Path) -> NDArray[np.uint8]:
         """Turn (N,) indices of category.json, from a file, into (N,) uint8 train ids."""
         assert self._category_train_ids is not None  # no record has labels without this table
         train_ids = self._category_train_ids[indices]
@@ -264,7 +265,8 @@ class NuScenes(Dataset):
                 "use the tables that came with the labels"
             )
 
-        return train_ids.astype(np.uint8)
+        checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
+        return checked
 
     def _read_records(self) -> dict[str, list[ScanRecord]]:
         """Read the tables; return the scans of every scene, by its name, in order of time."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 
 from amvnet.data.formats.cloud import MOST_RINGS, Cloud, check_point_count
 from amvnet.data.formats.rows import ADVICE, NAMES, UNKNOWN, RowLayout, are_rings, named_cloud
@@ -168,13 +168,19 @@ def _is_kitti(table: np.ndarray) -> bool:
     return bool(is_around and np.mean(is_usual) >= USUAL)
 
 
-def _are_near(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _are_near(
+    x: NDArray[np.floating], y: NDArray[np.floating], z: NDArray[np.floating]
+) -> NDArray[np.bool_]:
     """Return (N,) bool: points that are lost, or as near as a sensor sees."""
     is_lost = ~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
-    return is_lost | (np.abs(x) < NEAR) & (np.abs(y) < NEAR) & (np.abs(z) < NEAR)
+    is_near = (np.abs(x) < NEAR) & (np.abs(y) < NEAR) & (np.abs(z) < NEAR)
+    is_either: NDArray[np.bool_] = is_lost | is_near
+    return is_either
 
 
-def _are_intensities(values: np.ndarray) -> np.ndarray:
+def _are_intensities(values: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (N,) bool: values that can be intensities, also of lost points."""
     is_possible = (values >= 0) & (values <= MAX_INTENSITY)
-    return is_possible | (values == NO_INTENSITY) | ~np.isfinite(values)
+    is_missing = (values == NO_INTENSITY) | ~np.isfinite(values)
+    is_intensity: NDArray[np.bool_] = is_possible | is_missing
+    return is_intensity

@@ -12,8 +12,8 @@ from uuid import uuid4
 from amvnet.data.formats import feather, las, numpy_files, packed, pcd, ply, text
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.cloud import COLUMN_NAMES, Arrays, Cloud, Names, make_cloud
-from amvnet.data.formats.detect import ARCHIVE, BAGS, FOLDER, GZIP, NUSCENES_ENDING, TEXT
-from amvnet.data.formats.raw import read_raw
+from amvnet.data.formats.detect import ARCHIVE, BAGS, FOLDER, GZIP, TEXT
+from amvnet.data.formats.raw import NUSCENES_ENDING, read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
 from amvnet.errors import InputError, readable

@@ -48,7 +48,10 @@ class PolarGrid:
     def pool(self, features: Tensor) -> Tensor:
         """Return the maximum (F, C) of the points' features (S, C) in each seen pillar."""
         if features.is_cpu and features.requires_grad and not torch.compiler.is_compiling():
-            return _PillarMaximum.apply(features, self.seen_slot, len(self.seen))
+            maximum: Tensor = _PillarMaximum.apply(  # type: ignore[no-untyped-call]
+                features, self.seen_slot, len(self.seen)
+            )
+            return maximum
         return _pillar_maximum(features, self.seen_slot, len(self.seen))
 
     def pool_by_parts(self, encode: Callable[[Tensor], Tensor], part: int) -> Tensor:
@@ -94,7 +97,7 @@ class PolarGrid:
             scores: (M, Z * K) logits or probabilities of the occupied pillars, voxel by voxel.
         """
         vertical = self.shape[3]
-        voxels = scores.unflatten(1, (vertical, scores.shape[1] // vertical)).flatten(0, 1)
+        voxels: Tensor = scores.unflatten(1, (vertical, scores.shape[1] // vertical)).flatten(0, 1)
         return voxels.index_select(0, self.slot * vertical + self.voxel)
 
 
