@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.reader import ReaderError
 
 from amvnet.errors import InputError, shown
 
@@ -233,8 +234,26 @@ def parse_yaml(text: str, expected: str) -> Any:
     try:
         return yaml.load(text, _BoundedLoader)
     except (yaml.YAMLError, ValueError) as error:  # ValueError: numbers and dates
-        reason = " ".join(str(error).split())
-        raise InputError(f"{expected}, found {reason[:300]}; correct it") from None
+        raise InputError(f"{expected}, found {_fault_of_yaml(error, text)}; correct it") from None
+
+
+def _fault_of_yaml(error: Exception, text: str) -> str:
+    """Return in a few words what is wrong in a YAML text, and in which of its lines."""
+    if isinstance(error, ReaderError):
+        last = text.count("\n", 0, error.position) + 1
+        first = last
+        reason = f"the character {chr(error.character)!r}"
+    elif isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        last = error.problem_mark.line + 1
+        first = last if error.context_mark is None else error.context_mark.line + 1
+        reason = (error.problem or "no YAML").replace("'<stream end>'", "the end")
+    else:
+        return " ".join(str(error).split())[:300]
+
+    if "\n" not in text:
+        return f"a mistake ({reason})"
+    place = f"line {last}" if first == last else f"lines {first} to {last}"
+    return f"a mistake in {place} ({reason})"
 
 
 class _BoundedLoader(yaml.SafeLoader):

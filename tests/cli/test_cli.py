@@ -83,6 +83,23 @@ def read_json(path: Path) -> Any:
 # ---- a user's mistakes
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "predict {w}/none.bin --weights {w}/w.safetensors --out {out}",
+        "view {w}/none.bin --weights {w}/w.safetensors --html {out}/page.html",
+        "analyze {w}/none --weights {w}/w.safetensors --out {out}",
+        "analyze {w}/data --sequences 05 --weights {w}/w.safetensors --out {out}",
+        "bench --weights {w}/w.safetensors --scan {w}/none.bin",
+    ],
+)
+def test_a_missing_input_is_found_before_the_networks_are_loaded(
+    command: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refusal(command.format(w=world, out=tmp_path))
+    assert "computing on" not in capsys.readouterr().out
+
+
 # {w} is the folder `world`, {out} a folder of the test.
 BENCH = "bench --weights {w}/w.safetensors --scan {w}/lone.bin"
 EVALUATE = "evaluate {w}/data --weights {w}/w.safetensors"

@@ -148,12 +148,19 @@ def test_broken_scans_are_named_and_the_others_are_checked(
     code, error = run_cli("check", data)
     assert code == 3
     assert "a/1.npy" in error
-    assert "found 2 broken" in error
+    assert "found 2 broken scans" in error
     assert "4 scans" not in error
     assert str(3 * np.count_nonzero(RAW == 3)) in capsys.readouterr().out
     line = train(data)
     assert "found 2 of 6 scans that cannot" in line
     assert "a/1.npy" in line
+
+
+def test_one_broken_scan_is_one(data: Path) -> None:
+    (data.parent / "a/1.npy").write_bytes(b"no array")
+    code, error = run_cli("check", data)
+    assert code == 3
+    assert "found 1 broken scan; correct it or leave it out" in error
 
 
 def refuse_to_read(patch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.select import split_records, training_records
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
+from amvnet.errors import InputError
 
 from fixtures.commands import fails, run_cli
 from fixtures.scan_writers import some_points, write_las, write_ply
@@ -319,6 +320,8 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
         ({"labels": "truth.npy"}, "{name}"),
         ({"split": {"training": "a"}}, "training"),
         ({"clases": {}, "extra": 1}, "extra"),
+        ({"clases": {"a": 1}}, "found 'clases'; did you mean classes?"),
+        ({"split": {"vall": "a"}}, "found 'vall'; did you mean val?"),
     ],
 )
 def test_mistakes_in_the_file_are_said_in_one_line(
@@ -327,6 +330,54 @@ def test_mistakes_in_the_file_are_said_in_one_line(
     np.save(site / "a.npy", some_points())
     path = describe(site.parent, **changes)
     fails(lambda: open_own(path), path.name if word != "found none" else word, word)
+
+
+def test_a_typo_in_a_key_follows_the_name_of_the_file(site: Path) -> None:
+    path = describe(site.parent, clases={"a": 1})
+    fails(lambda: open_own(path), f"{path}: expected keys of")
+
+
+@pytest.mark.parametrize(
+    ("text", "mistake"),
+    [
+        ("classes: {a: 1, b: 2\nscans: '*.npy'\n", "a mistake in lines 1 to 2 (expected ','"),
+        ("classes: {a: 1}\n\tscans: x\n", "a mistake in line 2 (found character '\\t'"),
+        ("scans: a\nlabels: \x01\n", "a mistake in line 2 (the character '\\x01')"),
+        ("scans: a\nclasses: [1, 2\n", "(expected ',' or ']', but got the end)"),
+    ],
+)
+def test_a_broken_yaml_file_is_one_short_line_with_the_place_of_the_mistake(
+    tmp_path: Path, text: str, mistake: str
+) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        open_own(path)
+    line = str(caught.value).removeprefix(str(path))
+    assert mistake in line
+    assert len(line) < 200
+    assert "<" not in line  # no source, such as <unicode string>
+
+
+def test_a_message_names_a_label_file_without_dots(tmp_path: Path) -> None:
+    (tmp_path / "data/points").mkdir(parents=True)
+    (tmp_path / "data/labels").mkdir()
+    (tmp_path / "sets").mkdir()
+    np.save(tmp_path / "data/points/a.npy", some_points())
+    path = tmp_path / "data/labels/a.label"
+    RAW[:-1].astype(np.uint32).tofile(path)
+    changes = {"root": "../data", "scans": "points/*.npy", "labels": "../labels/{name}.label"}
+    fails(lambda: only_scan(tmp_path / "sets", **changes), f"{path}: expected 60 labels")
+
+
+def test_dots_after_a_link_lead_to_the_folder_above_its_target(tmp_path: Path) -> None:
+    (tmp_path / "disk/points").mkdir(parents=True)
+    (tmp_path / "disk/labels").mkdir()
+    np.save(tmp_path / "disk/points/a.npy", some_points())
+    RAW.astype(np.uint32).tofile(tmp_path / "disk/labels/a.label")
+    (tmp_path / "site").symlink_to(tmp_path / "disk/points")
+    labels = only_scan(tmp_path, labels="../labels/{name}.label")
+    np.testing.assert_array_equal(labels, EXPECTED)
 
 
 def test_a_column_of_labels_is_named_by_its_number(site: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +30,7 @@ ADVICE = (
 def predict(
     inputs: Sequence[str],
     request: LabellingRequest,
-    segmenter: Segmenter,
+    make_segmenter: Callable[[], Segmenter],
     folder: Path,
     *,
     sequences: Sequence[str] | None = None,
@@ -47,7 +47,8 @@ def predict(
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
         request: how the scans are labelled, and which files are written for each.
-        segmenter: computes the labels, with the weights, method and tau of the request.
+        make_segmenter: returns the segmenter that computes the labels, with the weights, method and
+            tau of the request. It is called once the inputs are listed, because it may take long.
         folder: the folder for the files.
         sequences, split: which scans of datasets to use, as `ScanOptions` takes them.
         batch: the number of scans that go through the networks together.
@@ -67,17 +68,18 @@ def predict(
             is broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
-    request = replace(request, precision=segmenter.engine.precision)  # not "auto"
     classes = request.classes
     normaliser = normaliser_for(request.weights, request.sensor, report)
     options = ScanOptions(sequences, split, request.topic, request.layout)
-    scans, taxonomy = list_inputs(inputs, options, segmenter.taxonomy, normaliser)
+    scans, taxonomy = list_inputs(inputs, options, request.weights.taxonomy, normaliser)
     if classes is not None:
         for scan in scans:
             if isinstance(scan, DatasetScan):
                 scan.written = classes.target
         taxonomy = classes.target
 
+    segmenter = make_segmenter()
+    request = replace(request, precision=segmenter.engine.precision)  # not "auto"
     output = request.output(folder, overwrite=overwrite, resume=resume)
     pipeline = Pipeline(
         scans,

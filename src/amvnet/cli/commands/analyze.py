@@ -65,7 +65,6 @@ def analyze(
         )
     loaded = load(weights)
     dataset = normalised(open_dataset(data, loaded.taxonomy), normaliser_for(loaded))
-    segmenter = load_segmenter(loaded, "amvnet", compute)
     records = choice.records(dataset)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
@@ -79,6 +78,7 @@ def analyze(
         scans = TrainingScans(dataset, dataset.labelled(dataset.records(names)), records)
         plan = Plan(load_recipe(recipe), scans, out, resume=True, report=report)
 
+    segmenter = load_segmenter(loaded, "amvnet", compute)
     make_folder(out)
     with progress("scoring") as step:
         analysis = analyze_records(dataset, records, segmenter, step)

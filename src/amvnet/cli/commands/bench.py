@@ -42,6 +42,8 @@ def bench(
 
     if json is not None:
         check_outputs({json: FIGURES}, [weights, scan], overwrite)
+    if scan is not None:
+        read_cloud(scan)  # before the networks are loaded, which may take long
     segmenter = load_segmenter(weights, "amvnet", compute, tau)
 
     with temporary_folder() as folder:

@@ -37,9 +37,10 @@ def check(data: str, /, choice: TrainingChoice) -> None:
             report(f"broken: {message}")
         raise InputError(errors[0])
     if broken:
+        found = counted(len(broken), "broken scan")
+        them = "it" if len(broken) == 1 else "them"
         raise SomeBroken(
-            f"expected scans that can be read, found {len(broken)} broken ones; correct them or "
-            "leave them out",
+            f"expected scans that can be read, found {found}; correct {them} or leave {them} out",
             list(broken.values()),
         )
     scans = sum(len(split.scans) for split in checked.splits.values())

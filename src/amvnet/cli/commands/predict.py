@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_segmenter
@@ -10,6 +11,9 @@ from amvnet.config.bounds import Count
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute
 from amvnet.progress import counted
+
+if TYPE_CHECKING:
+    from amvnet.inference.segmenter import Segmenter
 
 
 def predict(
@@ -47,13 +51,15 @@ def predict(
         if "://" in text:
             raise InputError(f"{text}: expected a path, found a URL; use amvnet fleet")
     request = labels.parse(load(weights), choice, known, compute)
-    segmenter = load_segmenter(request.weights, request.method, compute, request.tau)
+
+    def make_segmenter() -> Segmenter:
+        return load_segmenter(request.weights, request.method, compute, request.tau)
 
     with progress("segmenting") as step:
         written = predict_inputs(
             inputs,
             request,
-            segmenter,
+            make_segmenter,
             Path(out),
             sequences=choice.sequences,
             split=choice.split,

@@ -67,18 +67,19 @@ def view(
         check_outputs({html: PAGE}, [*inputs, labels, weights, known.sensor], overwrite)
         make_folder(html.parent)
 
-    segmenter = None
     classes = None if taxonomy is None else TAXONOMIES[taxonomy]
     normaliser = Normaliser(None, sensor, report)
-    if weights is not None:
-        loaded = load(weights)
-        segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
-        classes = segmenter.taxonomy
+    loaded = None if weights is None else load(weights)
+    if loaded is not None:
+        classes = loaded.taxonomy
         normaliser = normaliser_for(loaded, sensor, report)
 
     listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser)
     if labels is not None:
         check_labels(labels, len(listed))
+    segmenter = None
+    if loaded is not None:
+        segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
     chosen = evenly_spaced(listed, scans)
     page = html or temporary_page()
     with progress("looking") as step:

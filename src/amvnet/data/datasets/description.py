@@ -11,7 +11,7 @@ from typing import Any
 
 from amvnet.data.formats.rows import UNKNOWN, USUAL_TYPE, RowLayout
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
-from amvnet.errors import InputError, errors_of, shown
+from amvnet.errors import InputError, did_you_mean, errors_of, shown
 from amvnet.files import read_yaml
 
 ENDINGS = (".yaml", ".yml")
@@ -39,7 +39,20 @@ class LabelPlace:
 
     def path_of(self, scan: Path, name: str) -> Path:
         """Return the file of the labels of a scan, given its file and its name."""
-        return scan if self.file is None else scan.parent / self.file.replace("{name}", name)
+        return scan if self.file is None else below(scan.parent, self.file.replace("{name}", name))
+
+
+def below(folder: Path, name: str) -> Path:
+    """Return the path of a name relative to a folder, without `..` where there are no links.
+
+    People read the path in messages.
+    """
+    parts = Path(name).parts
+    # The parent of a link is not the folder that `..` leads to.
+    while parts[:1] == ("..",) and folder.name not in ("", "..") and not folder.is_symlink():
+        folder = folder.parent
+        parts = parts[1:]
+    return folder.joinpath(*parts)
 
 
 @dataclass(frozen=True)
@@ -88,8 +101,8 @@ def read_description(path: Path | str) -> Description:
 
 def _parse(path: Path, tree: Any) -> Description:
     """Return what the YAML file says."""
-    _check_keys("the file", tree, KEYS, required=("classes", "scans"))
-    root = (path.parent / os.path.expanduser(_text(tree, "root", "."))).absolute()
+    _check_keys("", tree, KEYS, required=("classes", "scans"))
+    root = below(path.parent.absolute(), os.path.expanduser(_text(tree, "root", ".")))
 
     scans = _text(tree, "scans")
     if Path(scans).is_absolute() or ".." in Path(scans).parts:
@@ -197,21 +210,27 @@ def _parse_split(entry: Any) -> dict[str, tuple[str, ...]]:
 
 
 def _check_keys(title: str, tree: Any, keys: Sequence[str], required: Sequence[str] = ()) -> None:
-    """Raise InputError if a mapping lacks a key or has an unknown one, or is none."""
+    """Raise InputError if a mapping lacks a key or has an unknown one, or is no mapping.
+
+    Args:
+        title: the key of the mapping; empty for the whole file.
+    """
+    prefix = f"{title}: " if title else ""
     if not isinstance(tree, Mapping):
         raise InputError(
-            f"{title}: expected the keys {', '.join(keys)}, found {shown(tree)}; "
+            f"{prefix}expected the keys {', '.join(keys)}, found {shown(tree)}; "
             "see docs/own_data.md"
         )
 
     for key in tree:
         if key not in keys:
             raise InputError(
-                f"{title}: expected keys of {', '.join(keys)}, found {shown(key)}; correct the key"
+                f"{prefix}expected keys of {', '.join(keys)}, found {shown(key)}"
+                + did_you_mean(str(key), keys, "correct the key")
             )
     for key in required:
         if key not in tree:
-            raise InputError(f"{title}: expected the key {key}, found none; add it")
+            raise InputError(f"{prefix}expected the key {key}, found none; add it")
 
 
 def _text(tree: Mapping[str, Any], key: str, usual: str | None = None) -> str:

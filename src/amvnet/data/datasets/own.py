@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import glob
-import os
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -100,7 +99,7 @@ class OwnScans(Dataset):
                 check_classes(self.spec, self.description.unread, self.taxonomy)
             if place is not None:
                 scan = self._scans[records[0].name]
-                path = os.path.normpath(place.path_of(scan.path, scan.name))
+                path = place.path_of(scan.path, scan.name)
                 found = f"no {path}"
                 if len(records) > 1:
                     found += f", and none for the other {len(records) - 1} scans"
