@@ -29,16 +29,16 @@ from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
 from amvnet.weights import hub
 
-PARTS = ("range_net", "polar_net", "point_head")  # of the method, by their names in `AMVNet`
+PARTS = ("range_net", "polar_net", "point_head")  # parts of the method, as `AMVNet` names them
 UNCERTAIN = "val/uncertain"  # metric of the point head: the share of uncertain points
-# The share for weights without this metric: that of the paper on nuScenes, and of `sim-hdl64e` on
-# simulated streets.
+# Share of uncertain points that is usual for weights without this metric: the paper has this share
+# on nuScenes, and `sim-hdl64e` has it on simulated streets.
 USUAL_UNCERTAIN = 0.2
-# Types of parameters, and of counts among them, by safetensors' names.
+# Types of parameters, and of parameters that count, by their names in safetensors.
 FLOATS = ("F16", "BF16", "F32", "F64")
 COUNTS = ("I64",)
-LONGEST = 10_000_000  # characters of a description; the built-in ones have 6,000
-MOST_PARAMETERS = 500_000_000  # of a model; that of the paper has about 60 million
+LONGEST_DESCRIPTION = 10_000_000  # limit in characters; built-in weights have 6,000
+MOST_PARAMETERS = 500_000_000  # limit for a model; the paper's model has about 60 million
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
 _FIELD_TYPES = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
@@ -54,8 +54,8 @@ class Weights:
         sensor: name of the sensor that they were trained for; "" if unknown.
         tensors: the parameters by name; each name begins with its part: "range_net.",
             "polar_net." or "point_head.".
-        training: by part, a record of how it was trained.
-        metrics: by part, its validation metrics.
+        training: for each part, a record of how it was trained.
+        metrics: for each part, its validation metrics.
     """
 
     model: ModelConfig
@@ -87,7 +87,7 @@ class Weights:
         return USUAL_UNCERTAIN
 
     def usual_uncertain_at(self, tau: float | None) -> float | None:
-        """Return `usual_uncertain` for the weights' own tau, or None for another one."""
+        """Return `usual_uncertain` for the weights' own tau, and None for any other tau."""
         return self.usual_uncertain if tau in (None, self.model.assertion.threshold) else None
 
     def part(self, name: str) -> dict[str, Tensor]:
@@ -217,7 +217,7 @@ def load(name_or_path: str | Path) -> Weights:
 def _from_description(text: str) -> Weights:
     """Return weights without parameters: what the description in a file says."""
     description = None
-    if len(text) <= LONGEST:
+    if len(text) <= LONGEST_DESCRIPTION:
         with suppress(ValueError, RecursionError):
             description = json.loads(text)
     if not isinstance(description, dict) or description.get("format") != FORMAT:
@@ -250,12 +250,12 @@ def _from_description(text: str) -> Weights:
 
 
 def _read_tensors(file: Any, weights: Weights) -> dict[str, Tensor]:
-    """Read the parameters, if they are those of whole parts of the described model.
+    """Read the parameters of whole parts of the described model.
 
     Names, sizes and types are checked before anything is read.
 
     Raises:
-        InputError: if they are not, or not finite.
+        InputError: if the file has other parameters, or a parameter is not finite.
     """
     names = set(file.keys())
     with torch.device("meta"):  # without memory

@@ -31,7 +31,7 @@ class LabelPlace:
     Attributes:
         file: path of the label file, relative to the scan's folder, with `{name}` for the scan's
             name without its ending; None if the labels are in the scan's file.
-        field: the column or array that holds them; None in a file of nothing else.
+        field: the column or array that holds the labels; None if the file holds nothing else.
     """
 
     file: str | None = None
@@ -45,7 +45,7 @@ class LabelPlace:
 def below(folder: Path, name: str) -> Path:
     """Return the path of a name relative to a folder, without `..` where there are no links.
 
-    People read the path in messages.
+    Messages show the path, and without `..` it is easier to read.
     """
     parts = Path(name).parts
     # The parent of a link is not the folder that `..` leads to.
@@ -60,14 +60,15 @@ class Description:
     """What the YAML file of a dataset says.
 
     Attributes:
-        path: of the YAML file.
-        root: the folder that everything is relative to.
+        path: the path of the YAML file.
+        root: the folder that all other paths are relative to.
         taxonomy: the classes.
-        scans: pattern of the scan files.
+        scans: the pattern of the scan files.
         labels: where the labels are; None if there are none.
-        unread: classes of the labels, if they differ from `taxonomy`: such labels are not read.
+        unread: the classes of the labels, if they are not the classes in `taxonomy`. Such labels
+            are not read.
         split: names of folders and scans, and patterns, by split; empty if there is no split.
-        sensor: name or attributes of the sensor; None if it is to be measured.
+        sensor: the name or the attributes of the sensor; None if it is to be measured.
         layout: what rows of numbers without names hold.
     """
 
@@ -161,7 +162,7 @@ def _add(raw_to_train: dict[int | str, int], raw_id: int, train_id: int) -> None
 
 
 def _ids(title: str, values: Any) -> list[int]:
-    """Return raw ids; -1, which many tools write for no label, becomes the largest id."""
+    """Return raw ids; an id of -1, which many tools write for no label, becomes the largest id."""
     ids = []
     for raw_id in values if isinstance(values, list) else [values]:
         if type(raw_id) is not int or not -1 <= raw_id <= INSTANCE_MASK:
@@ -241,7 +242,7 @@ def _text(tree: Mapping[str, Any], key: str, usual: str | None = None) -> str:
 
 
 def _texts(title: str, values: Any) -> tuple[str, ...]:
-    """Return one or several texts; numbers, such as the sequence 07, count as texts."""
+    """Return one or several texts; a number, such as the sequence 07, counts as a text."""
     entries = values if isinstance(values, list | tuple) else [values]
     for entry in entries:
         if not isinstance(entry, str | int):

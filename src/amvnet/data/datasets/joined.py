@@ -1,4 +1,4 @@
-"""Several datasets as one to train on: the first is validated, the others are mixed in."""
+"""Several datasets joined to train on: the first also validates, the others are mixed in."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from amvnet.data.taxonomy import describe_difference
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
-SEED = 16  # of the order in which the scans of a mixed dataset take their turns
-# Successive scans that take their turns together, in random blocks: a simulated street at once, as
-# it is simulated whole, and several places of a drive.
+SEED = 16  # seed of the order in which the scans of a mixed dataset take their turns
+# Number of successive scans that take their turns together. A simulated street is simulated whole,
+# so all its scans take their turns together. Blocks at random show several places of a drive.
 BLOCK = SCANS
 
 
@@ -30,7 +30,7 @@ class MixedRecord(ScanRecord):
     Attributes:
         member: index of the dataset among all, 1 for the first that is mixed in.
         place: index of the place among the dataset's places.
-        original: the scan that takes the place.
+        original: the scan that has the place.
     """
 
     member: int
@@ -43,24 +43,25 @@ class Joined(Dataset):
 
     Scans of the first dataset keep their records. Scans of the others have a `MixedRecord`, whose
     sequence begins with the number of the dataset: "2/000012". A dataset with fewer places in an
-    epoch than scans shows other scans in the next epoch, and in the end all of them equally often.
+    epoch than scans shows other scans in the next epoch. In the end it has shown all equally often.
 
     Args:
-        scans: of the first dataset, which names the split, is validated, and takes predictions.
+        scans: the scans of the first dataset, which has the split, validates and takes predictions.
         others: the other datasets, with the scans to train on.
-        share: as for `join`.
+        share: the share of an epoch, as `join` takes it.
     """
 
     def __init__(self, scans: TrainingScans, others: Sequence[TrainingScans], share: float) -> None:
         self.dataset = scans.dataset
         super().__init__(self.dataset.root, self.dataset.taxonomy, self.dataset.spec)
         self.others = others
-        self.share = share / len(others)  # of each of the others
-        self.places = _places(len(scans.train), others, share)  # of each of the others, in an epoch
+        # The share and the places in an epoch that each of the others has.
+        self.share = share / len(others)
+        self.places = _places(len(scans.train), others, share)
 
     @property
     def specs(self) -> list[str]:
-        """The texts by which all of them are opened: PATH or PATH@SHARE."""
+        """The texts by which `open_dataset` opens the datasets; a share follows an @."""
         suffix = f"@{self.share:g}" if self.share else ""
         texts = [self.dataset.spec]
         for other in self.others:
@@ -97,13 +98,13 @@ class Joined(Dataset):
         return dataclasses.replace(turn, original=dataset.at_epoch(turn.original, epoch))
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
-        """Read a scan of any of them."""
+        """Read a scan of any of the datasets."""
         if not isinstance(record, MixedRecord):
             return self.dataset.read(record, labels)
         return self.others[record.member - 1].dataset.read(record.original, labels)
 
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
-        """Read the raw ids of a scan of any of them; the others may have ids of their own."""
+        """Read the raw ids of a scan of any dataset; each dataset may have its own ids."""
         if not isinstance(record, MixedRecord):
             return self.dataset.raw_labels(record, count)
         return self.others[record.member - 1].dataset.raw_labels(record.original, count)
@@ -124,11 +125,11 @@ class Joined(Dataset):
 def join(
     scans: TrainingScans, others: Sequence[TrainingScans], share: float = 0.0
 ) -> TrainingScans:
-    """Return scans to train on, with others mixed in; those to validate with stay the same.
+    """Mix other scans into the scans to train on; the scans to validate with stay the same.
 
     Args:
-        share: the share of an epoch's scans that the others have, in equal parts; 0 takes each of
-            their scans once per epoch.
+        share: the share of an epoch's scans that the others have in equal parts, in [0, 1). With 0,
+            each of their scans is in each epoch once.
 
     Raises:
         InputError: if a dataset has other classes, or the share leaves nothing for the first.

@@ -21,7 +21,7 @@ from amvnet.files import checked_token
 from amvnet.scan import Scan
 
 CHANNEL = "LIDAR_TOP"
-MAX_LISTED = 20  # scenes in a message
+MAX_LISTED = 20  # limit on the scenes in a message
 MINI = "v1.0-mini"
 TEST = "v1.0-test"
 
@@ -202,7 +202,7 @@ class NuScenes(Dataset):
         return super().write_prediction(record, folder, ids, taxonomy, count)
 
     def _find_version(self, version: str | None) -> str:
-        """Return the version to read: the one asked for, or the only one in the folder."""
+        """Return the version to read: the given one, or the only one in the folder."""
         folders = filter(Path.is_dir, self.root.glob("v1.0-*"))
         present = sorted(folder.name for folder in folders)
         if version is None and len(present) == 1:
@@ -318,5 +318,5 @@ def _is_scan(row: Row) -> bool:
 
 
 def _lookup(rows: list[Row], key: str, value: str) -> dict[str, Any]:
-    """Return the values in column `value` by those in column `key`."""
+    """Return a dictionary from the values in one column to the values in another."""
     return {row[key]: row[value] for row in rows}

@@ -18,9 +18,8 @@ Reader = type[SemanticKitti] | type[NuScenes]
 
 READERS: dict[str, Reader] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
 OWN = "files"  # prefix of the YAML file of a user's own scans
-SIMULATED = {
-    f"simulated-{sensor}": sensor for sensor in CLASSES_BY_SENSOR
-}  # names of sensors by prefix
+# Prefixes of simulated streets, each with the name of its sensor.
+SIMULATED = {f"simulated-{sensor}": sensor for sensor in CLASSES_BY_SENSOR}
 
 
 def open_dataset(spec: str, classes: Taxonomy | None = None) -> Dataset:

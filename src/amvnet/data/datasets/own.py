@@ -33,7 +33,7 @@ class OwnScans(Dataset):
 
     Args:
         description: what the YAML file says.
-        normalise: makes scans of the points in the files; None takes them as they are.
+        normalise: makes scans of the points in the files; without it, points stay unchanged.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class OwnScans(Dataset):
 
     @property
     def is_split(self) -> bool:
-        """Whether the file has a split; what it does not name is not chosen by default."""
+        """Whether the file has a split; scans that it does not name are not chosen by default."""
         return bool(self.description.split)
 
     def official(self, split: str) -> tuple[str, ...]:
@@ -150,21 +150,21 @@ class OwnScans(Dataset):
         return self._counts[record.name]
 
     def recordings(self) -> dict[str, list[NamedScan]]:
-        """Return the scans of each recording, in order; each has one folder and one ending."""
+        """Return the scans of each recording, in order: files of one folder and one ending."""
         recordings: dict[str, list[NamedScan]] = {}
         for scan in self._scans.values():
             recordings.setdefault(scan.source, []).append(scan)
         return recordings
 
     def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
-        """Return the scans for predictions of other classes; their labels are not read."""
+        """Return the same scans with other classes for predictions; labels are not read."""
         description = dataclasses.replace(
             self.description, taxonomy=taxonomy, unread=self.description.unread or self.taxonomy
         )
         return OwnScans(description, self.normalise)
 
     def files_of(self, record: ScanRecord) -> list[Path]:
-        """Return the files of a scan: its labels are the user's even if they are not read."""
+        """Return the files of a scan, with its label file even if labels are not read."""
         files = super().files_of(record)
         place = self.description.labels
         if place is not None:
@@ -253,9 +253,9 @@ class OwnScans(Dataset):
         return fixed.name or "all"
 
     def _splits(self) -> dict[str, str]:
-        """Return the split of each scan, by its name; "" if it is in none.
+        """Return the split of each scan by the scan's name; "" if it is in none.
 
-        If the file names a split but no "train", all scans that it does not name are of it.
+        If the file has a split without "train", the scans that it does not name are in "train".
 
         Raises:
             InputError: if an entry of the split matches no scan, or a scan is in two splits.

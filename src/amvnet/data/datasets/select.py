@@ -11,10 +11,10 @@ from amvnet.errors import InputError
 
 @dataclass(frozen=True)
 class TrainingScans:
-    """The scans of a dataset to train on, and those to validate with, which may be none.
+    """The scans of a dataset to train on, and the scans to validate with, if there are any.
 
     Attributes:
-        unlabelled: scans that were chosen and have no labels, which are skipped.
+        unlabelled: chosen scans without labels, which are skipped.
 
     Raises:
         InputError: if a scan is in both `train` and `val`.
@@ -41,12 +41,12 @@ def split_records(
     """Return the scans to train on and to validate with.
 
     Args:
-        train, val: sequences; None for those of `Dataset.sequences`.
+        train, val: names of sequences; by default the sequences that `Dataset.sequences` returns.
         with_val: also train on the sequences of `val`, and validate with none.
 
     Raises:
-        InputError: if no sequence is left for one of the two, a sequence does not exist or is one
-            of the test split, or a scan is in both.
+        InputError: if no sequence is left to train on or to validate with, a sequence does not
+            exist or belongs to the test split, or a scan is in both.
     """
     names_train, names_val = named_sequences(dataset, train, val, with_val)
     chosen = dataset.records(names_train)
@@ -62,7 +62,7 @@ def split_records(
 def named_sequences(
     dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
 ) -> tuple[list[str], list[str]]:
-    """Return the sequences of `split_records`, to train on and to validate with."""
+    """Return the sequences to train on and to validate with; `split_records` has the arguments."""
     # A sequence that the user named for one purpose is not used for the other by default.
     by_default = _sequences_with_val if with_val else Dataset.sequences
     names_val = list(val) if val else _without(by_default(dataset, "val"), train or ())
@@ -86,7 +86,7 @@ def named_sequences(
 
 
 def _sequences_with_val(dataset: Dataset, split: str) -> tuple[str, ...]:
-    """Return the sequences of a split for a training on all scans; one may be empty."""
+    """Return the sequences of a split for a training on all scans; a split may be empty."""
     try:
         return dataset.sequences(split)
     except InputError:
@@ -94,7 +94,7 @@ def _sequences_with_val(dataset: Dataset, split: str) -> tuple[str, ...]:
 
 
 def _refuse_test(dataset: Dataset, names: Sequence[str]) -> None:
-    """Raise InputError if sequences to train on are of the test split."""
+    """Raise InputError if a sequence to train on belongs to the test split."""
     try:
         test = dataset.official("test")
     except InputError:  # there is none

@@ -27,19 +27,19 @@ from lidarstreets import simulate as simulate_streets
 
 # The classes in the files that the simulator writes for each sensor.
 CLASSES_BY_SENSOR = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
-SCANS = 6  # of a street
+SCANS = 6  # number of scans of a street
 TRAIN_STREETS = {"hdl64e": 140, "hdl32e": 84}
 VAL_STREETS = 6
-FIRST_VAL_STREET = 900_000  # training uses the streets below
+FIRST_VAL_STREET = 900_000  # streets with lower numbers are for training
 LAST_STREET = 999_999
 
-# The numbers of the streets rise by this from epoch to epoch: new streets help a training, more
-# scans of the same streets do not (docs/log.md).
+# From one epoch to the next, the numbers of the streets rise by this step: new streets help a
+# training, more scans of the same streets do not (docs/log.md).
 STREET_STEP = 1000
 
 SEED = 64  # `amvnet simulate`, whose seed is 0 by default, makes other streets
 CACHE_BYTES = 25 * 10**9
-ABANDONED = 3600  # seconds after which the process that was writing a street must have been killed
+ABANDONED = 3600  # age of an unfinished street whose process must have been killed, seconds
 
 # The simulator, with its errors as `InputError`.
 simulate = one_line_errors(str, only=(SimulationError,))(simulate_streets)
@@ -54,11 +54,11 @@ class SimulatedStreets(Dataset):
     the streets that were read longest ago are removed.
 
     Args:
-        root: the folder of the cache; made if there is none.
-        sensor: the name of a sensor in `CLASSES_BY_SENSOR`, whose benchmark has the classes.
+        root: the folder of the cache, which is made if it does not exist.
+        sensor: the name of a sensor in `CLASSES_BY_SENSOR`.
     """
 
-    readers = 1  # two would simulate the same street
+    readers = 1  # two threads would simulate the same street
 
     def __init__(self, root: Path | str, sensor: str = "hdl64e") -> None:
         super().__init__(root, CLASSES_BY_SENSOR[sensor], f"simulated-{sensor}:{root}")
@@ -96,20 +96,20 @@ class SimulatedStreets(Dataset):
         return list(records)
 
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
-        """Return the (N,) train ids of the points: the cache has no others."""
+        """Return the (N,) train ids of the points: the cache has no raw ids."""
         labels = self.read(record).labels
         assert labels is not None
         return labels
 
     def train_ids_by_raw(self) -> np.ndarray:
-        """Return the train ids by train id."""
+        """Return each train id as its own raw id."""
         return np.arange(self.taxonomy.size + 1, dtype=np.int16)
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan; simulate its street if it is not in the cache."""
         street = record.points_path.parent
         with suppress(FileNotFoundError):
-            os.utime(street)  # just read: other processes keep it
+            os.utime(street)  # marks the street as just read, so that other processes keep it
             return self._load(record, labels)
 
         self._simulate(int(record.sequence), street)
@@ -147,7 +147,7 @@ class SimulatedStreets(Dataset):
         )
 
     def _load(self, record: ScanRecord, labels: bool) -> Scan:
-        """Read a scan from the cache; raise FileNotFoundError if it is not there."""
+        """Read a scan from the cache; raise FileNotFoundError if the cache lacks it."""
         folder = record.points_path
 
         try:
@@ -173,7 +173,7 @@ class SimulatedStreets(Dataset):
         _make_room(self.root, street)
 
     def _drive(self, number: int) -> Iterator[Scan]:
-        """Yield the scans of a street as the files of `amvnet simulate` have them."""
+        """Yield the scans of a street, equal to the scans that `amvnet simulate` writes."""
         seed = np.random.SeedSequence((SEED, number))
         with one_line_errors(str, only=(SimulationError,)):
             for scan in drive_street(self.sensor, SCANS, seed):
@@ -227,7 +227,7 @@ def _put(part: Path, street: Path) -> None:
 
 
 def _make_room(root: Path, latest: Path) -> None:
-    """Remove the streets that were read longest ago until the cache is small."""
+    """Remove the streets that were read longest ago until the cache is small enough."""
     for part in root.glob("streets-*/.*.part"):
         with suppress(FileNotFoundError):  # another process may be removing it
             if time.time() - part.stat().st_mtime > ABANDONED:
