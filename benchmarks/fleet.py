@@ -166,7 +166,7 @@ def plan(names: int) -> None:
     A second time, all of them are done.
     """
     from amvnet.fleet.manifest import list_scans
-    from amvnet.fleet.on_ray import Cluster, FleetRun, _windows
+    from amvnet.fleet.pipeline import Cluster, FleetRun, _windows
     from amvnet.fleet.results import Results, results_schema
     from amvnet.fleet.storage import Place
     from amvnet.inference.request import LabellingRequest

@@ -13,11 +13,11 @@ from amvnet.cli.recipe_options import HELP_ALL
 
 PAGE = "command_line.md"
 PLACE = "<!-- the help of every command -->"
-WIDTH = 100  # columns
+WIDTH = 100  # the width of the help, characters
 
 
 def help_of(*words: str, option: str = "--help") -> str:
-    """Return what `amvnet WORDS --help` prints, or another option."""
+    """Return what `amvnet WORDS` prints with --help or another option."""
     os.environ["COLUMNS"] = str(WIDTH)
     printed = io.StringIO()
     with redirect_stdout(printed), suppress(SystemExit):

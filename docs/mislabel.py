@@ -1,7 +1,7 @@
 """Give 1 % of the things in a dataset another class, and score a ranking that looks for them.
 
 python mislabel.py DATA WRONG SEED [alike]     writes WRONG, a copy with wrong labels
-python mislabel.py WRONG RANKING.csv           prints the share found in the first rows
+python mislabel.py WRONG RANKING.csv           prints the share that the first rows have found
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.labels.ids import write_ids
 from amvnet.ranking.clusters import cluster
 
-SHARE = 0.01  # of the things
-MIN_POINTS = 10  # of a thing
-# Classes that are easily mistaken for each other: car and truck, pole and trunk, ...
+SHARE = 0.01  # the share of the things that get another class
+MIN_POINTS = 10  # the least number of points of a thing
+# Groups of classes that are easily mistaken for each other: car and truck, pole and trunk, ...
 ALIKE = [(1, 2, 3, 4, 5), (6, 7, 8), (9, 10, 11, 12, 17), (13, 14), (15, 16, 18, 19)]
 
 
 def mislabel(data: str, wrong: str, seed: int, alike: bool) -> None:
-    """Write a copy of a dataset with wrong labels, and which points they belong to."""
+    """Write a copy of a dataset with wrong labels, and a file that says which points have them."""
     shutil.copytree(data, wrong)
     dataset = open_dataset(data)
     copy = open_dataset(wrong)
@@ -55,7 +55,7 @@ def mislabel(data: str, wrong: str, seed: int, alike: bool) -> None:
 
 
 def list_things(dataset: Dataset, records: list[ScanRecord]) -> list[tuple[int, int]]:
-    """Return (index of the scan, thing) for all labelled things with enough points."""
+    """Return (index of the scan, number of the thing) for all labelled things of enough points."""
     things = []
     for index, record in enumerate(records):
         scan = dataset.read(record)
@@ -68,13 +68,16 @@ def list_things(dataset: Dataset, records: list[ScanRecord]) -> list[tuple[int, 
 
 
 def connected(scan: Scan) -> np.ndarray:
-    """Return (N,) the connected thing of one class that each point is part of."""
+    """Return (N,) the number of the thing that each point belongs to.
+
+    A thing is a set of connected points of one class.
+    """
     assert scan.labels is not None
     return cluster(scan.points[:, :3], scan.labels)
 
 
 def other_classes(label: int, alike: bool, count: int) -> list[int]:
-    """Return the classes that a label can be replaced by."""
+    """Return the classes that can replace a label."""
     classes = tuple(range(1, count + 1))
     if alike:
         classes = next(group for group in ALIKE if label in group)

@@ -231,7 +231,7 @@ def legend_rows(present: np.ndarray) -> int:
 
 
 def reduced(sheet: Image.Image, taxonomy: Any) -> Image.Image:
-    """Return the picture in 256 colours, those of the classes among them: a third of the file."""
+    """Return the picture in 256 colours, which include the class colours; its file is a third."""
     sample = Image.new("RGB", (sheet.width, sheet.height + 20 * taxonomy.size))
     sample.paste(sheet, (0, 0))
     for place, color in enumerate(class_colors(taxonomy, np.arange(1, taxonomy.size + 1))):
@@ -269,7 +269,7 @@ def main() -> None:
     segmenter = amvnet.load("sim-hdl64e")
     result = segmenter(arguments.scan)
     truth = official(np.load(arguments.labels, allow_pickle=False), segmenter.taxonomy)
-    scan = replace(result.require_origin().scan, labels=truth)  # its origin is that of the sensor
+    scan = replace(result.require_origin().scan, labels=truth)  # its origin is the sensor
     sheet = draw(scan, result, segmenter.taxonomy, CAMERA)
     reduced(sheet, segmenter.taxonomy).save(arguments.out, optimize=True)
     print(arguments.out, sheet.size, arguments.out.stat().st_size)

@@ -2,9 +2,9 @@
 
     python docs/results.py
 
-Each page has its table between the lines `<!-- results -->` and `<!-- end of results -->`. Change a
-figure in docs/results.json only, and run this. A test compares the pages with the file, also the
-outputs of commands in them.
+Each page has its table between the lines `<!-- results -->` and `<!-- end of results -->`. Change
+figures only in docs/results.json, and run this. A test compares the tables of the pages, and the
+outputs of commands on them, with the file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ REGION = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.S)
 
 
 def read() -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of the file: of the built-in weights, and of fine-tuning."""
+    """Return the rows of the file, for the built-in weights and for fine-tuning."""
     figures = json.loads(FIGURES.read_text(encoding="utf-8"))
     assert isinstance(figures, dict)
     return figures
@@ -59,7 +59,7 @@ PAGES = {
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return rows as a table in Markdown, the best method of each in bold."""
+    """Return rows as a table in Markdown; the best method of each row is in bold."""
     lines = [
         "| Scans | Weights | RV | BEV | Plain ensemble | Ensemble | AMVNet | Uncertain |",
         "|---|---|---|---|---|---|---|---|",

@@ -1,4 +1,4 @@
-"""What MkDocs adds to the pages: the address of the repository, and a scan to look at in 3D."""
+"""Let MkDocs add the address of the repository, and a page that shows a scan in 3D."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from amvnet.cli.commands.demo import SEED
 from amvnet.cli.main import DONE, main
 
 ROOT = Path(__file__).parents[1]
-LIVE = "live/index.html"  # docs/index.md shows it
+LIVE = "live/index.html"  # the page of the scan, which docs/index.md shows
 
 
 def on_config(config: Any, **_: Any) -> Any:

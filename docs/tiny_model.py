@@ -1,6 +1,6 @@
-"""A tiny model: how often each class is at a height, a distance and an intensity.
+"""A tiny model that counts how often each class has a height, a distance and an intensity.
 
-python tiny_model.py DATA OUT     learns from the sequences 00 to 03, and writes scores of all
+python tiny_model.py DATA OUT     learns from the sequences 00 to 03, writes scores of all sequences
 """
 
 import sys
@@ -10,11 +10,11 @@ import numpy as np
 
 from amvnet.data.datasets.open import open_dataset
 
-SIZE = (40, 20, 10)  # cells of height, distance and intensity
+SIZE = (40, 20, 10)  # the numbers of cells of height, distance and intensity
 
 
 def cells(points: np.ndarray) -> np.ndarray:
-    """Return (N,) the index of the cell that each of (N, 4) points is in."""
+    """Return (N,) the index of the cell of each of (N, 4) points."""
     height = (points[:, 2] + 3) / 8
     distance = np.hypot(points[:, 0], points[:, 1]) / 60
     shares = np.stack([height, distance, points[:, 3]])

@@ -2,7 +2,7 @@
 
     python docs/try_page.py FOLDER
 
-builds it alone. The files in docs/try are its source. This module adds the networks of the built-in
+builds the page alone. Its source is in docs/try. This module adds the networks of the built-in
 weights, a sample scan, the viewer, and ONNX Runtime Web, which `npm ci --prefix docs/try` fetches.
 """
 
@@ -24,9 +24,9 @@ from lidarstreets import simulate
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "docs" / "try"
-PATTERNS = ("*.html", "*.css", "*.js", "*/*.js")  # of SOURCE; node_modules lies deeper
+PATTERNS = ("*.html", "*.css", "*.js", "*/*.js")  # the files of SOURCE; node_modules lies deeper
 RUNTIME = SOURCE / "node_modules" / "onnxruntime-web" / "dist"
-RUNTIME_FILES = (  # for the CPU, and for GPUs
+RUNTIME_FILES = (  # three files for the CPU, three for GPUs
     "ort.wasm.min.mjs",
     "ort-wasm-simd-threaded.mjs",
     "ort-wasm-simd-threaded.wasm",
@@ -44,16 +44,16 @@ MODELS = (
     {"folder": "sim-hdl32e", "title": "HDL-32E, 16 classes"},
 )
 SAMPLE_SEED = 80
-SAMPLE_STREET = 7  # not of the training
+SAMPLE_STREET = 7  # the training has no such street
 
-CACHE = ROOT / "build" / "try"  # of what takes a minute to make
+CACHE = ROOT / "build" / "try"  # keeps what takes a minute to make
 MADE_BY = ("config", "export", "models", "sensors", "weights")  # the packages that decide graphs
 
 
 def on_post_build(config: Any, **_: Any) -> None:
     """Add the page to the site; MkDocs calls this at the end."""
     out = Path(config["site_dir"]) / "try"
-    shutil.rmtree(out, ignore_errors=True)  # what MkDocs has copied
+    shutil.rmtree(out, ignore_errors=True)  # MkDocs has copied the source
     if RUNTIME.is_dir():
         build(out)
     else:
@@ -61,7 +61,7 @@ def on_post_build(config: Any, **_: Any) -> None:
 
 
 def build(out: Path) -> None:
-    """Write the page and all that it needs into a folder."""
+    """Write the page and all its files into a folder."""
     for pattern in PATTERNS:
         for path in SOURCE.glob(pattern):
             copy(path, out / path.relative_to(SOURCE))
@@ -82,7 +82,7 @@ def copy(path: Path, to: Path) -> None:
 
 
 def viewer() -> str:
-    """Return the page of the viewer, which takes the scan from the page around it."""
+    """Return the viewer's page, which takes the scan from the page around it."""
     colors = {"unlabelled": UNLABELLED, "drawn": DRAWN}
     script = (SOURCE / "viewer_data.js").read_text(encoding="utf-8")
     return fill_page("Scan", drawing() | colors, replaced={"scans.js": script})
@@ -98,7 +98,7 @@ def graphs(name: str) -> Path:
 
 
 def sample() -> Path:
-    """Return a simulated scan in KITTI's format."""
+    """Return the path of a simulated scan in KITTI's format."""
 
     def make(folder: Path) -> None:
         with tempfile.TemporaryDirectory() as city:
@@ -110,7 +110,7 @@ def sample() -> Path:
 
 
 def cached(name: str, sources: list[Path], make: Any) -> Path:
-    """Return a folder that `make` has filled, unless one of its sources has changed since."""
+    """Return a folder that `make` has filled; it is filled again if one of the sources changes."""
     digest = hashlib.sha256()
     for path in sources:
         if "__pycache__" not in path.parts:

@@ -1,13 +1,13 @@
-// Writes labels as files, as `amvnet predict` does: an id of the benchmark for each point, in the order of the scan.
+// Write labels as files, as `amvnet predict` does: an id of the benchmark for each point, in the order of the scan.
 
-/** Return the ids (n) in uint32 of a benchmark's files, given those of the valid points and their places. */
+/** Return the uint32 ids (n) of a benchmark's files for all points, given the labels and places of the valid points. */
 export function rawIds(labels, places, total, classes) {
   const raw = new Uint32Array(total).fill(classes[0].raw_id);
   labels.forEach((label, i) => (raw[places[i]] = classes[label].raw_id));
   return raw;
 }
 
-/** Return the parts of a file of these ids: `label` (nothing else), or `npy` (NumPy's format 1.0). */
+/** Return the parts of a file of ids; `kind` is `label` (only the ids) or `npy` (NumPy's format 1.0). */
 export function partsOf(kind, ids) {
   if (kind === "label") return [ids];
   const text = `{'descr': '<u4', 'fortran_order': False, 'shape': (${ids.length},), }`;

@@ -1,7 +1,7 @@
-/** Input that cannot be used: one line says what was expected, what was found and what to do, as `amvnet predict` does. */
+/** Input that cannot be used. One line says what was expected, what was found and what to do, as `amvnet predict` does. */
 export class InputError extends Error {}
 
-/** Return text from a file for an error message: in quotes, on one line and short. */
+/** Return text from a file for an error message: in quotes, in one line, and short. */
 export function shown(text, longest = 100) {
   return `'${[...text].slice(0, longest).map((letter) => (/[ -~]/.test(letter) ? letter : "?")).join("")}'`;
 }

@@ -1,4 +1,4 @@
-// The page around the viewer: takes scans, shows what the worker does with them, offers the labels.
+// The page around the viewer takes scans, shows what the worker does with them, and offers the labels.
 
 import { counted } from "./errors.js";
 import { partsOf, rawIds, save } from "./download.js";
@@ -13,7 +13,7 @@ async function fetched(path) {
   return response;
 }
 
-/** Ask the worker to label the file, or only to show it; answers to earlier questions are then ignored. */
+/** Ask the worker to label the file, or only to show it. Answers to earlier requests are then ignored. */
 function ask(isPreview = false) {
   if (!file) return;
   result = null;
@@ -30,7 +30,7 @@ function chosen() {
   return models[byId("weights").selectedIndex];
 }
 
-/** Show the state of the work, also to programs that read the page, such as tests. */
+/** Show the state of the work. Programs that read the page, such as tests, find it in `data-state`. */
 function setState(state, text) {
   document.documentElement.dataset.state = state;
   byId("state").textContent = text;
@@ -67,7 +67,7 @@ function fail(text) {
   setState("failed", "");
 }
 
-/** Show a scan in a new frame, from the same place as the one before. */
+/** Show a scan in a new frame, from the same point of view as the scan before. */
 function show(shown) {
   const before = byId("viewer"), frame = before.cloneNode();
   const camera = before.src ? /camera=[^&]*/.exec(before.contentWindow.location.hash) : null;
@@ -77,7 +77,7 @@ function show(shown) {
   before.replaceWith(frame);
 }
 
-/** Let files be dropped on a window: the page's, or the frame's. */
+/** Let files be dropped on a window, which is the page's or the frame's. */
 function takeDrops(target) {
   target.addEventListener("dragover", (event) => {
     event.preventDefault();

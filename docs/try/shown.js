@@ -1,16 +1,17 @@
-// Packs a scan for the viewer: positions in int16, everything else in bytes.
+// Pack a scan for the viewer: positions in int16, all other values in bytes.
 
 import { counted } from "./errors.js";
 import { quantilesOf } from "./sensor/statistics.js";
 
-const MOST_POINTS = 400_000;  // of larger scans the viewer shows every second or third point
-const REACH = 500;  // metres along each axis: farther points are left out
-const LEVELS = 32_767;  // largest int16
+const MOST_POINTS = 400_000;  // the most points that the viewer shows; of larger scans, every second or third point
+const REACH = 500;  // the largest coordinate that the viewer shows, metres
+const LEVELS = 32_767;  // the largest int16
 const TITLES = { rv: "RV", bev: "BEV", ensemble: "Ensemble", amvnet: "AMVNet" };
 
 /**
- * Return {about, scan, indices} of a normalised scan {points, count} and what `segment` returned for it, or null:
- * what the viewer needs to know, the scan as it draws it, and the index in `points` of each point that it draws.
+ * Return {about, scan, indices}: what the viewer needs to know, the packed scan, and the index in `points` of each
+ * point that the viewer draws. They are made of a normalised scan {points, count} and of what `segment` returned for
+ * it, which may be null.
  */
 export function shownScan(name, { points, count }, segmentation, description) {
   const isNear = (i) => [0, 1, 2].every((axis) => Math.abs(points[4 * i + axis]) <= REACH);
@@ -35,7 +36,7 @@ export function shownScan(name, { points, count }, segmentation, description) {
   return { about: aboutOf(scan, points, indices, labels, description), scan, indices };
 }
 
-/** Return {firstShare, second, secondShare} of points: percent of the best class, the second id, its percent. */
+/** Return {firstShare, second, secondShare} of points: the best class in percent, the second best class, its percent. */
 function bestTwo(scores, indices, k) {
   const best = Object.fromEntries(["firstShare", "second", "secondShare"].map((key) => [key, new Uint8Array(indices.length)]));
   indices.forEach((i, place) => {
@@ -45,7 +46,7 @@ function bestTwo(scores, indices, k) {
       if (row[c] > row[first]) [first, second] = [c, first];
       else if (second < 0 || row[c] > row[second]) second = c;
     }
-    // Two networks that are wholly sure of different classes leave no score at all.
+    // Two networks that are wholly sure of different classes leave a score of 0 for every class.
     const percent = (c) => Math.round(100 * (sum > 0 ? row[c] / sum : 1 / k));
     best.firstShare[place] = percent(first);
     if (second < 0) return;
@@ -60,7 +61,7 @@ function noteOf(leftOut, stride) {
   return [missing, stride > 1 ? `one in ${stride} of the scan` : ""].filter(Boolean).join("; ");
 }
 
-/** Return {center, step, positions}: the points as multiples of a step, in int16. */
+/** Return {center, step, positions}: the points as int16 multiples of a step from the centre. */
 function quantised(points, indices) {
   const center = [], step = [], positions = new Int16Array(3 * indices.length);
   for (let axis = 0; axis < 3; axis++) {
@@ -82,7 +83,7 @@ function aboutOf(scan, points, indices, labels, { classes, taxonomy }) {
     title: "AMVNet in the browser",
     classes: ["unlabelled", ...classes.slice(1).map((each) => each.name)],
     raw: classes.map((each) => each.raw_id),
-    official: classes,  // with the colours of label files
+    official: classes,  // they have the colours of label files
     taxonomy,
     present: [...present].sort((a, b) => a - b),
     sources: Object.keys(labels).map((key) => ({ key, title: TITLES[key] })),

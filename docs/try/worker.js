@@ -1,8 +1,8 @@
-// Reads and segments scans away from the page, which stays alive.
+// Read and segment scans in a worker, so that the page stays responsive.
 //
-// Takes {id, file, folder, isPreview}: a scan file, and the folder of the weights. Sends messages with the same id:
-// {kind: "loading", share}, {kind: "step", title, seconds}, {kind: "shown", ...}, {kind: "labelled", ...} and
-// {kind: "failed", text}.
+// The worker takes {id, file, folder, isPreview}: a scan file, and the folder of the weights. It sends messages with
+// the same id: {kind: "loading", share}, {kind: "step", title, seconds}, {kind: "shown", ...},
+// {kind: "labelled", ...} and {kind: "failed", text}.
 
 import { InputError } from "./errors.js";
 import { segment } from "./method/amvnet.js";
@@ -11,7 +11,7 @@ import { readCloud } from "./reading/read.js";
 import { normalise } from "./sensor/normalise.js";
 import { shownScan } from "./shown.js";
 
-const LARGEST = 200;  // megabytes of a file
+const LARGEST_FILE = 200;  // the largest file that is read, megabytes
 const MOST_THREADS = 8;
 let runtime = null, loaded = { folder: null, networks: null }, last = Promise.resolve();
 
@@ -41,7 +41,7 @@ async function label({ id, file, folder, isPreview }) {
   const run = async () => segment(await load(folder, description, (share) => send("loading", { share })), scan, step);
   const segmentation = await run().catch(async (error) => {
     if (runtime.device === "wasm" || error instanceof InputError) throw error;
-    runtime = await start("wasm");  // the GPU cannot do it
+    runtime = await start("wasm");  // the GPU has failed
     loaded = { folder: null, networks: null };
     return run();
   });
@@ -51,22 +51,22 @@ async function label({ id, file, folder, isPreview }) {
 }
 
 async function bytesOf(file) {
-  if (file.size > LARGEST * 1e6) {
+  if (file.size > LARGEST_FILE * 1e6) {
     const size = (file.size / 1e6).toFixed(0);
     throw new InputError(
-      `${file.name}: expected a file of at most ${LARGEST} MB, found ${size} MB; split it into scans, ` +
+      `${file.name}: expected a file of at most ${LARGEST_FILE} MB, found ${size} MB; split it into scans, ` +
       "or label it with amvnet predict",
     );
   }
   return new Uint8Array(await file.arrayBuffer());
 }
 
-/** Return what the weights know of scans, for `normalise`. */
+/** Return a description of the scans that the weights know, for `normalise`. */
 function expectationOf({ range_view: view, normalise: { sensor, intensity, as_is: isAsIs } }) {
   return { view, sensor, intensity, isAsIs };
 }
 
-/** Load ONNX Runtime, for the GPU if `wanted` is "webgpu" and the browser offers one. Returns {ort, device, text}. */
+/** Load ONNX Runtime, for the GPU if `wanted` is "webgpu" and the browser offers one. Return {ort, device, text}. */
 async function start(wanted) {
   const isPossible = wanted === "webgpu" && "Suspending" in WebAssembly;
   const adapter = isPossible ? await navigator.gpu?.requestAdapter() : null, device = adapter ? "webgpu" : "wasm";
@@ -78,7 +78,7 @@ async function start(wanted) {
   return { ort, device, text: adapter ? "on the GPU" : `with ${many}` };
 }
 
-/** Return the networks of a folder; those of another folder are dropped. */
+/** Return the networks of a folder; drop the networks of any other folder. */
 async function load(folder, description, progress) {
   if (loaded.folder === folder) return loaded.networks;
   await loaded.networks?.release();

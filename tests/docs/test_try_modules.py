@@ -407,7 +407,7 @@ def broken_files(folder: Path) -> list[Path]:
 
 
 # Words that differ: what a library says, and the page's own limit.
-OWN_WORDS = ("found a broken one", "expected a scan of at most")
+OWN_WORDS = ("found a broken file", "expected a scan of at most")
 
 
 def test_a_broken_file_gives_the_line_of_the_command(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-// AMVNet, step by step as in the paper: project, score twice, compare, classify what is uncertain, merge.
+// AMVNet, step by step as in the paper: project, score twice, compare, classify the uncertain points, merge.
 
 import { geometricMean, labelsOf, merged, similarityOf } from "./fusion.js";
 import { classify } from "./head.js";

@@ -1,6 +1,6 @@
-// Compares the two networks (section 3.2 of the paper) and merges their probabilities f and g (n K) (section 3.3).
+// Compare the two networks (section 3.2 of the paper), and merge their probabilities f and g (n K) (section 3.3).
 
-const TINY = 1e-12;  // keeps quotients finite
+const TINY = 1e-12;  // the least divisor, which keeps quotients finite
 
 /** Return the cosine similarity (n) of the networks' probabilities. */
 export function similarityOf(f, g, k) {
@@ -22,7 +22,7 @@ export function geometricMean(f, g) {
   return f.map((value, place) => Math.sqrt(value * g[place]));
 }
 
-/** Return probabilities (n K) with those of the head (u K) at the uncertain points (u). */
+/** Return the mean (n K), in which the uncertain points (u) have the probabilities of the head (u K). */
 export function merged(mean, uncertain, head, k) {
   const scores = mean.slice();
   uncertain.forEach((i, row) => scores.set(head.subarray(row * k, (row + 1) * k), i * k));

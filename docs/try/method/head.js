@@ -1,6 +1,6 @@
-// The point head (section 3.3 of the paper): decides uncertain points by what both networks say around them.
+// The point head (section 3.3 of the paper) decides uncertain points by the scores of both networks around them.
 
-const PART = 2048;  // uncertain points at a time, which bounds the memory
+const PART = 2048;  // the number of uncertain points that are classified at a time, which limits the memory
 
 /**
  * Return the head's probabilities (u K) of uncertain points (u), given the points (4 p), both networks' probabilities

@@ -1,17 +1,17 @@
-// Finds nearest neighbours with a k-d tree. (npm's well-kept libraries find the nearest in two dimensions, or only one.)
+// Find nearest neighbours with a k-d tree. The well-kept libraries of npm search in two dimensions, or find only one.
 
-const LEAF = 12;  // points that are compared one by one
+const LEAF = 12;  // the most points of a leaf, which are compared one by one
 
 export class KdTree {
   /** Sort points (4 n) into a tree. */
   constructor(points) {
     this.points = points;
     this.ids = Uint32Array.from({ length: points.length / 4 }, (_, i) => i);
-    this.axes = new Uint8Array(this.ids.length);  // of the point in the middle of each branch: how it is divided
+    this.axes = new Uint8Array(this.ids.length);  // the axis that divides each branch, at the place of its middle point
     this.divide(0, this.ids.length);
   }
 
-  /** Divide the ids from start to end in halves, along the axis of their largest extent. */
+  /** Divide the ids from start to end into halves, along the axis of their largest extent. */
   divide(start, end) {
     if (end - start <= LEAF) return;
     const middle = (start + end) >> 1, axis = this.widestAxis(start, end);
@@ -38,7 +38,7 @@ export class KdTree {
     return extents.indexOf(Math.max(...extents));
   }
 
-  /** Move ids so that none before `middle` is larger along the axis, and none after it smaller (quickselect). */
+  /** Move ids so that, along the axis, no point before `middle` is larger and none after it is smaller (quickselect). */
   select(middle, left, right, axis) {
     while (left < right) {
       const pivot = this.at((left + right) >> 1, axis);
@@ -92,15 +92,15 @@ export class KdTree {
 }
 
 /**
- * Return the n nearest others (u n) of each point `own` (u) of points (4 p), the nearest first. If there are fewer
- * than n others, the farthest is repeated. A lone point is its own neighbour.
+ * Return the n nearest other points (u n) of each point in `own` (u) among points (4 p), the nearest first. If there
+ * are fewer than n others, the farthest is repeated. A lone point is its own neighbour.
  */
 export function nearestOthers(points, own, n) {
   const tree = new KdTree(points), m = Math.min(n + 1, points.length / 4);
   const neighbours = new Uint32Array(own.length * n);
   own.forEach((point, row) => {
     const found = Array.from(tree.nearest(point, m));
-    // If many points coincide, a point may be missing from its own neighbours. Then the last one is dropped instead.
+    // If many points coincide, a point may be missing from its own neighbours. Then the last neighbour is dropped.
     if (m > 1) found.splice(found.includes(point) ? found.indexOf(point) : m - 1, 1);
     for (let rank = 0; rank < n; rank++) neighbours[row * n + rank] = found[Math.min(rank, found.length - 1)];
   });

@@ -1,4 +1,4 @@
-// Runs the networks: the graphs of `amvnet export`, in ONNX Runtime Web.
+// Run the networks, which are graphs of `amvnet export`, in ONNX Runtime Web.
 
 import { InputError } from "../errors.js";
 import { atPixels } from "./range_view.js";
@@ -6,14 +6,14 @@ import { addToMaxima, atPillars, FEATURES, toMap } from "./polar_view.js";
 
 const FORMAT = 2, DESCRIPTION = "amvnet.json";
 const POLAR = ["polar_points", "polar_pillars", "polar_map", "polar_scores"];
-// The graphs that each method needs
+// The graphs that each method needs.
 const GRAPHS = {
   rv: ["range_net"],
   bev: POLAR,
   ensemble: ["range_net", ...POLAR],
   amvnet: ["range_net", ...POLAR, "point_head"],
 };
-const PART = 16_384;  // points or pillars that a graph takes at a time, which bounds the memory
+const PART = 16_384;  // the number of points or pillars that a graph takes at a time, which limits the memory
 
 /** Read the description in a folder of `amvnet export`. */
 export async function readDescription(folder) {
@@ -24,7 +24,7 @@ export async function readDescription(folder) {
   const description = await response.json();
   if (description.format !== FORMAT || !(description.method in GRAPHS) || !description.normalise) {
     throw new InputError(
-      `${folder}/${DESCRIPTION}: expected format ${FORMAT}, a known method and the key normalise, found others; ` +
+      `${folder}/${DESCRIPTION}: expected format ${FORMAT}, a known method and the key normalise, found another file; ` +
       "export again",
     );
   }
@@ -32,7 +32,7 @@ export async function readDescription(folder) {
 }
 
 export class Networks {
-  /** Load the graphs of a folder into `ort`; `progress` is called with the share that is loaded. */
+  /** Load the graphs of a folder into `ort`. `progress` is called with the share that is loaded, in [0, 1]. */
   static async load(ort, folder, description, device, progress) {
     const networks = new Networks();
     Object.assign(networks, { ort, description, sessions: {}, k: description.classes.length - 1 });
@@ -74,7 +74,7 @@ export class Networks {
     const pillars = toMap(await this.run("polar_pillars", [[pooled, [seen.length, channels]]]), seen, size);
     const decoded = await this.run("polar_map", [[pillars, [1, pillars.length / size, radial, angular]]]);
 
-    // Also pillars with none but points that are too near to be seen have scores.
+    // Pillars whose points are all too near to be seen also have scores.
     const occupied = Int32Array.from(new Set(pillar)), slots = new Int32Array(size);
     occupied.forEach((place, slot) => (slots[place] = slot));
     const logits = new Float32Array(pillar.length * this.k), scores = [];
@@ -89,7 +89,7 @@ export class Networks {
     return softmax(logits, this.k);
   }
 
-  /** Return the probabilities (u K) of uncertain points by the point head, given their features and neighbours'. */
+  /** Return the head's probabilities (u K) of uncertain points, given the features of points and their neighbours. */
   async scorePoints(point, rows, count) {
     const width = point.length / count, n = rows.length / point.length;
     return softmax(await this.run("point_head", [[point, [count, width]], [rows, [count, n, width]]]), this.k);

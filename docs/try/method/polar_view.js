@@ -2,11 +2,12 @@
 
 import { cellOf, distanceOf } from "./range_view.js";
 
-export const FEATURES = 9;  // offsets to the centre of the cell (3), polar coordinates (3), x, y, intensity
+// The number of features of a point: offsets to the centre of its cell (3), radius, angle, z, x, y, intensity.
+export const FEATURES = 9;
 
 /**
- * Sort points (4 n) into the polar grid. Returns {features, pillar, voxel, isSeen}: the features (9 n), each point's
- * pillar, its voxel within the pillar, and whether it is far enough from the sensor to be seen.
+ * Sort points (4 n) into the polar grid. Return {features, pillar, voxel, isSeen}: the features (9 n), the pillar of
+ * each point, its voxel within the pillar, and whether it is far enough from the sensor to be seen.
  */
 export function polarGrid(view, points) {
   const count = points.length / 4, features = new Float32Array(FEATURES * count);
@@ -37,7 +38,7 @@ export function addToMaxima(maxima, pillar, features) {
   });
 }
 
-/** Return a map (C, R A) that has the values (m C) at the pillars (m), zeros elsewhere. */
+/** Return a map (C, R A) that has the values (m C) at the pillars (m), and zeros elsewhere. */
 export function toMap(values, pillars, size) {
   const channels = values.length / pillars.length, map = new Float32Array(channels * size);
   pillars.forEach((pillar, row) => {

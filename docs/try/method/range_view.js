@@ -1,24 +1,24 @@
-// The range view (section 3.1 of the paper): a scan as an image of lasers by azimuth.
+// The range view (section 3.1 of the paper): a scan as an image, with a row for each laser or elevation.
 
 import { InputError } from "../errors.js";
 import { elevationOf, rowAt } from "../sensor/rows.js";
 
 const CHANNELS = 6;  // x, y, z, intensity, range, mask
 
-/** Return the distance of point i of points (4 n) from the sensor, metres, in float32 as in the training. */
+/** Return the distance from the sensor to point i of points (4 n), metres, in float32 as in the training. */
 export function distanceOf(points, i) {
   const [x, y, z] = points.subarray(4 * i, 4 * i + 3), add = (a, b) => Math.fround(a + b);
   return Math.fround(Math.sqrt(add(add(Math.fround(x * x), Math.fround(y * y)), Math.fround(z * z))));
 }
 
-/** Return the number of the cell, of `cells` equal parts of [0, 1], that holds a share; if outside, the nearest. */
+/** Divide [0, 1] into equal cells; return the number of the cell that holds a share, or the nearest cell. */
 export function cellOf(share, cells) {
   return Math.min(Math.max(Math.floor(share * cells), 0), cells - 1);
 }
 
 /**
- * Project points (4 n) to a range image. Returns {image, pixel}: (6, H, W) float32, and the pixel (n) of each point,
- * counted row by row. A pixel with several points shows the nearest to the sensor, of equally near ones the first.
+ * Project points (4 n) to a range image. Return {image, pixel}: the image (6, H, W) in float32, and the pixel (n) of
+ * each point, counted row by row. A pixel shows its point nearest to the sensor; of equally near points, the first.
  */
 export function rangeImage(view, points, rows) {
   const { height, width } = view, count = points.length / 4, plane = height * width;
@@ -50,7 +50,7 @@ function checkRows({ rows: kind, height }, rows) {
   );
 }
 
-/** Return the logits (n K) of the points, those of their pixels in an image (K, H, W). */
+/** Return the logits (n K) of the points, which they take from their pixels in an image (K, H, W). */
 export function atPixels(scores, pixel, k) {
   const plane = scores.length / k, logits = new Float32Array(pixel.length * k);
   for (let c = 0; c < k; c++) {

@@ -1,16 +1,17 @@
 // The points of a scan file, before anything is assumed of the sensor.
 //
 // A column is {values, isInteger}: a typed array with a number per point, and whether the file stores integers.
-// A cloud is {name, count, xyz, intensity, ring}: xyz (3 count) holds x, y, z of each point, float32 if the file's
-// coordinates are, else float64; intensity is a column and ring (count) the index of each point's laser, or null.
+// A cloud is {name, count, xyz, intensity, ring}. xyz (3 count) holds x, y, z of each point, in float32 if the file has
+// float32, else in float64. intensity is a column, and ring (count) holds the index of each point's laser; both may be
+// null.
 
 import { counted, InputError, shown } from "../errors.js";
 
-// A page has less memory than a program; `amvnet predict` reads ten million points.
+// The most points of a scan. A page has less memory than a program: `amvnet predict` reads ten million points.
 export const MOST_POINTS = 1_000_000;
-const MOST_RINGS = 256;  // a column with larger values does not hold ring indices
+const MOST_RINGS = 256;  // the most lasers; a column with larger values does not hold ring indices
 
-// The possible names of each column; the first that a file has is read.
+// The possible names of each column; the first name that a file has is read.
 const NAMES = {
   x: ["x"],
   y: ["y"],
@@ -33,7 +34,7 @@ export function checkPointCount(count, name, size = 0, least = 0) {
   }
 }
 
-/** Return {x: index, ...}: which of the named columns of a file hold what is read. */
+/** Return {x: index, ...}: the indices of the columns to read, given the names of a file's columns. */
 export function requireColumns(names, name) {
   const lower = names.map((each) => each.toLowerCase()), found = {};
   for (const [key, aliases] of Object.entries(NAMES)) {
@@ -47,7 +48,7 @@ export function requireColumns(names, name) {
   return found;
 }
 
-/** Return the cloud of the columns {x, y, z, intensity, ring}, of which the last two may be missing. */
+/** Return the cloud of the columns {x, y, z, intensity, ring}; intensity and ring may be missing. */
 export function makeCloud(columns, name) {
   const axes = [columns.x, columns.y, columns.z], count = axes[0].values.length;
   const isFloat32 = axes.every(({ values }) => values instanceof Float32Array);
@@ -59,26 +60,26 @@ export function makeCloud(columns, name) {
   return { name, count, xyz, intensity: columns.intensity ?? null, ring };
 }
 
-/** Return values as ring indices, 0 for NaN; null if they are all equal, negative, too large or not whole. */
+/** Return values as ring indices, 0 for NaN; null if all are equal, or one is negative, not whole or too large. */
 export function ringIndices(values) {
   const ring = Uint8Array.from(values, (value) => (Number.isFinite(value) ? value : 0));
   let low = Infinity, high = -Infinity;
   for (let i = 0; i < values.length; i++) {
     const value = Number.isFinite(values[i]) ? values[i] : 0;
-    if (value !== ring[i]) return null;  // a byte holds whole numbers below MOST_RINGS only
+    if (value !== ring[i]) return null;  // a byte holds only whole numbers below MOST_RINGS
     low = Math.min(low, value);
     high = Math.max(high, value);
   }
   return low < high && high < MOST_RINGS ? ring : null;
 }
 
-/** Return whether the point at xyz[start] has finite coordinates and is not at 0, 0, 0, as lost returns are. */
+/** Return whether the point at xyz[start] has finite coordinates other than 0, 0, 0, which lost returns have. */
 export function isPlaced(xyz, start) {
   const [x, y, z] = [xyz[start], xyz[start + 1], xyz[start + 2]];
   return Number.isFinite(x) && Number.isFinite(y) && Number.isFinite(z) && (x !== 0 || y !== 0 || z !== 0);
 }
 
-/** Return the finite intensities of the points with a place, ascending: what lost returns have says nothing. */
+/** Return the finite intensities of the points with a place, ascending; intensities of lost returns mean nothing. */
 export function measuredIntensities({ xyz, intensity }) {
   if (!intensity) return new Float64Array(0);
   return Float64Array.from(intensity.values).filter((value, i) => Number.isFinite(value) && isPlaced(xyz, 3 * i)).sort();

@@ -1,12 +1,12 @@
-// Records of numbers with named fields, as PCD and PLY have them: in text and in binary.
+// Read records of numbers with named fields from PCD and PLY files, in text or in binary.
 //
 // A field is {name, type, count}: its type is one of TYPES, and it has `count` values in a record.
 
 import { InputError } from "../errors.js";
 
-const LONGEST_HEADER = 65_536;  // bytes
+const LONGEST_HEADER = 65_536;  // the longest header of a file, bytes
 
-// For each type its size in bytes, the typed array that holds its values, and the method of a DataView that reads one.
+// The types: the size in bytes, the typed array that holds values, and the method of a DataView that reads a value.
 export const TYPES = {
   i1: [1, Int8Array, "getInt8"],
   u1: [1, Uint8Array, "getUint8"],
@@ -20,12 +20,12 @@ export const TYPES = {
   f8: [8, Float64Array, "getFloat64"],
 };
 
-/** Return the bytes of a record. */
+/** Return the size of a record, bytes. */
 export function recordSize(fields) {
   return fields.reduce((size, { type, count }) => size + TYPES[type][0] * count, 0);
 }
 
-/** Read the first value of chosen fields {key: index} of binary records, which begin at `start`. */
+/** Read the first value of chosen fields {key: index} of binary records. The records begin at `start`. */
 export function readBinary(bytes, start, points, fields, chosen, isLittle = true) {
   const stride = recordSize(fields), columns = {};
   for (const [key, index] of Object.entries(chosen)) {
@@ -43,7 +43,7 @@ export function readColumn(bytes, offset, stride, points, type, isLittle = true)
   return { values, isInteger: type[0] !== "f" };
 }
 
-/** Read chosen fields of the lines of text that begin at `start`. */
+/** Read chosen fields {key: index} of lines of text. The lines begin at `start`. */
 export function readText(bytes, start, points, fields, chosen, name) {
   const lines = new TextDecoder("latin1").decode(bytes.subarray(start)).split("\n").filter((line) => line.trim());
   if (lines.length < points) {
@@ -59,7 +59,7 @@ export function readText(bytes, start, points, fields, chosen, name) {
   return Object.fromEntries(entries.map(([key, index], column) => [key, asType(table[column], fields[index].type)]));
 }
 
-/** Return a column of the type; one with NaN or infinity stays float64, because integers cannot hold these. */
+/** Return a column of the type. A column with NaN or infinity stays float64, because integers cannot hold these. */
 function asType(values, type) {
   if (!values.every(Number.isFinite)) return { values, isInteger: false };
   return { values: TYPES[type][1].from(values), isInteger: type[0] !== "f" };
@@ -74,7 +74,7 @@ function numberOf(word = "") {
   return special[1] === "-" ? -Infinity : Infinity;
 }
 
-/** Reads the lines of a header; `end` names the line that ends it. */
+/** Reads the lines of a header. `end` names the line that ends the header. */
 export class Header {
   constructor(bytes, name, kind, end) {
     Object.assign(this, { bytes, name, kind, end, position: 0 });

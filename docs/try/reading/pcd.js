@@ -1,14 +1,14 @@
-// Point clouds in PCL's format: ascii, binary or binary_compressed, columns in any order.
+// Read point clouds in PCL's format: ascii, binary or binary_compressed, with columns in any order.
 
 import { InputError, shown } from "../errors.js";
 import { checkPointCount, makeCloud, requireColumns } from "./cloud.js";
 import { Header, readBinary, readColumn, readText, recordSize, TYPES, wholeOf } from "./fields.js";
 
 const KIND = "a PCD file";
-// LZF packs nothing more tightly than the longest repetition, in bytes, into its code of 3 bytes.
+// LZF packs at most LONGEST_REPETITION bytes into a code of REPETITION_CODE bytes. No data can be packed more tightly.
 const LONGEST_REPETITION = 264, REPETITION_CODE = 3;
 
-/** Return the cloud of the bytes of a file: of a field with several values, the first. */
+/** Return the cloud in the bytes of a file; if a field has several values, only the first is read. */
 export function readPcd(bytes, name) {
   const header = new Header(bytes, name, KIND, "line DATA"), entries = readEntries(header);
   const fields = fieldsOf(entries);
@@ -17,7 +17,7 @@ export function readPcd(bytes, name) {
   const start = header.position, encoding = (entries.DATA[0] ?? "").toLowerCase();
 
   if (encoding === "ascii") {
-    // Each value takes a character, and one more between any two of them.
+    // Each value takes at least one character, and another character separates two values.
     const values = fields.reduce((sum, { count }) => sum + count, 0);
     checkPointCount(points, name, bytes.length, 2 * values * points - 1);
     return makeCloud(readText(bytes, start, points, fields, chosen, name), name);
@@ -32,7 +32,7 @@ export function readPcd(bytes, name) {
   );
 }
 
-/** Return the words of the header's lines up to DATA, by the first of each. */
+/** Return the words of each line of the header, up to DATA, by the line's first word. */
 function readEntries(header) {
   const entries = {};
   while (!entries.DATA) {
@@ -54,7 +54,7 @@ function fieldsOf(entries) {
   return names.map((name, place) => ({ name, type: types[place], count: counts[place] }));
 }
 
-/** Read packed points: field by field, the values of all points, those of one point next to each other. */
+/** Read packed points. The data hold one field after the other; in each, the values of a point are side by side. */
 function readCompressed(bytes, start, points, fields, chosen, name) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const packed = view.getUint32(start, true), size = view.getUint32(start + 4, true);
@@ -78,14 +78,14 @@ function unpackLzf(data, size) {
   let filled = 0, position = 0;
   while (position < data.length && filled < size) {
     const control = data[position++];
-    if (control < 32) {  // a literal: the next control + 1 bytes as they are
+    if (control < 32) {  // a literal: the next control + 1 bytes are copied
       output.set(data.subarray(position, position + control + 1), filled);
       filled += control + 1;
       position += control + 1;
       continue;
     }
 
-    // A back reference: 3 bits of length, followed by a byte to add if all three are set, and 13 bits of distance.
+    // A back reference has 3 bits of length and 13 bits of distance. If all 3 bits are set, a byte to add follows.
     let length = (control >> 5) + 2;
     if (length === 9) length += data[position++];
     let from = filled - (((control & 31) << 8) + data[position++] + 1);

@@ -1,17 +1,17 @@
-// Point clouds in PLY files: the element `vertex`, ascii or binary of either byte order.
+// Read point clouds from PLY files: the element `vertex`, ascii or binary in either byte order.
 
 import { InputError, shown } from "../errors.js";
 import { checkPointCount, makeCloud, requireColumns } from "./cloud.js";
 import { Header, readBinary, readText, recordSize, wholeOf } from "./fields.js";
 
-// The types by both names of each.
+// The types by PLY's names; each type has two names.
 const TYPES = {
   char: "i1", int8: "i1", uchar: "u1", uint8: "u1", short: "i2", int16: "i2", ushort: "u2", uint16: "u2",
   int: "i4", int32: "i4", uint: "u4", uint32: "u4", float: "f4", float32: "f4", double: "f8", float64: "f8",
 };
 const FORMATS = ["ascii", "binary_little_endian", "binary_big_endian"];
 
-/** Return the cloud of the vertices in the bytes of a file. */
+/** Return the cloud of the vertices in a file, given its bytes. */
 export function readPly(bytes, name) {
   const header = new Header(bytes, name, "a PLY file", "end_header"), { format, elements } = readElements(header, name);
   const place = elements.findIndex((element) => element.name === "vertex");
@@ -27,7 +27,7 @@ export function readPly(bytes, name) {
 
   const chosen = requireColumns(fields.map((field) => field.name), name);
   if (format === "ascii") {
-    // Each value and each line before the vertices takes a character, and one more between any two of them.
+    // Each value, and each line before the vertices, takes at least one character. Another character separates two.
     const lines = before.reduce((sum, element) => sum + element.count, 0);
     checkPointCount(lines + count, name, bytes.length, 2 * (lines + count * fields.length) - 1);
     for (let line = 0; line < lines; line++) header.words();

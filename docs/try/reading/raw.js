@@ -1,24 +1,24 @@
-// Scan files that are only rows of float32: those of KITTI (x, y, z, intensity) and nuScenes (also the ring).
+// Read scan files that hold only rows of float32: KITTI's (x, y, z, intensity) and nuScenes' (also the ring).
 
 import { InputError } from "../errors.js";
 import { checkPointCount, makeCloud, ringIndices } from "./cloud.js";
 
 const COLUMNS = ["x", "y", "z", "intensity", "ring"];
-const KITTI = 4, NUSCENES = 5;  // columns
+const KITTI = 4, NUSCENES = 5;  // the number of columns of each layout
 const NAMED_NUSCENES = ".pcd.bin";
-const FEW = 4800;  // bytes: the values of smaller files may fit any layout
+const FEWEST_BYTES = 4800;  // the least size of a file whose values can show that no layout fits, bytes
 const ADVICE = "save it as a .pcd or .ply file, or label it with amvnet predict and --columns";
 
-// What tells coordinates and intensities from other columns, and float32 from other types.
-const LARGEST_INTENSITY = 65535;  // of any device
-const NEAR = 500;  // metres: coordinates of usual scans are smaller
-const NO_INTENSITY = -1;  // as some tools write for a lost return; no other intensity is negative
-const USUAL = 0.999;  // share of the points that must have such values; the others may be outliers
+// These limits tell coordinates and intensities from other columns, and float32 from other types.
+const LARGEST_INTENSITY = 65535;  // the largest intensity that any sensor writes
+const NEAR = 500;  // the limit of coordinates in usual scans, metres
+const NO_INTENSITY = -1;  // the intensity that some tools write for a lost return; no other is negative
+const USUAL_SHARE = 0.999;  // the least share of points within these limits; the others are outliers
 
-// What tells ring indices from labels: lasers have about as many points as each other, or each has one elevation.
-const UNEVEN = 2.5;  // the most points of a laser, times their mean
-const FEWEST_LASERS = 8;  // fewer classes can have similar numbers of points
-const SPREAD = 0.1;  // the largest variance of the elevations within a ring, as a share of the variance of all
+// These limits tell ring indices from labels: lasers have similar numbers of points, or each has one elevation.
+const LARGEST_RING = 2.5;  // the most points of a ring, relative to the mean ring
+const FEWEST_LASERS = 8;  // the fewest lasers; fewer classes may also have similar numbers of points
+const ELEVATION_SPREAD = 0.1;  // the largest variance of the elevations within a ring, relative to the scan's variance
 
 /** Return the cloud of rows in the layout that the values fit. */
 export function readRaw(bytes, name) {
@@ -28,7 +28,7 @@ export function readRaw(bytes, name) {
   let columns = null;
   if (nuscenes && isNuscenes(nuscenes, isNamed)) columns = nuscenes;
   else if (kitti && isKitti(kitti)) columns = kitti;
-  else if (bytes.length < FEW) columns = isNamed ? nuscenes : kitti;
+  else if (bytes.length < FEWEST_BYTES) columns = isNamed ? nuscenes : kitti;
   if (!columns) throw new InputError(`${name}: ${whyNeither(bytes.length, isNamed)}`);
 
   checkPointCount(columns[0].length, name);
@@ -36,7 +36,7 @@ export function readRaw(bytes, name) {
 }
 
 function whyNeither(size, isNamed) {
-  if (size < FEW) {
+  if (size < FEWEST_BYTES) {
     const width = isNamed ? NUSCENES : KITTI, names = COLUMNS.slice(0, width).join(" ");
     const expected = `expected rows of ${width} float32, columns ${names}`;
     return `${expected}, found ${size} bytes, which is no multiple of ${4 * width}; ${ADVICE}, or copy the file again`;
@@ -54,14 +54,14 @@ function columnsOf(bytes, width) {
   return COLUMNS.slice(0, width).map((_, column) => Float32Array.from({ length: count }, (_, row) => rows[width * row + column]));
 }
 
-/** Return whether columns can be x, y, z, intensity and ring; if not `isNamed`, they must not look like labels. */
+/** Return whether columns can be x, y, z, intensity and ring. Unless `isNamed`, rings must not look like labels. */
 function isNuscenes([x, y, z, intensity, values], isNamed) {
   if (!values.every(Number.isInteger) || !intensity.every(isIntensity)) return false;
   const ring = ringIndices(values), isFraction = [x, y, z].some((axis) => !axis.every(Number.isInteger));
   return ring !== null && isFraction && (isNamed || areRings(x, y, z, ring));
 }
 
-/** Return whether whole numbers are the rings of the points, and not their labels. */
+/** Return whether whole numbers are the rings of the points instead of their labels. */
 function areRings(x, y, z, ring) {
   const [counts, sums, squares] = [0, 1, 2].map(() => new Float64Array(256));
   ring.forEach((laser, i) => {
@@ -71,15 +71,15 @@ function areRings(x, y, z, ring) {
     squares[laser] += elevation * elevation;
   });
   const lasers = [...counts.keys()].filter((laser) => counts[laser]), extent = lasers.at(-1) - lasers[0];
-  const isEven = Math.max(...counts) * lasers.length <= UNEVEN * ring.length;
+  const isEven = Math.max(...counts) * lasers.length <= LARGEST_RING * ring.length;
   if (lasers.length >= FEWEST_LASERS && extent < 2 * lasers.length && isEven) return true;
 
   const total = (values) => values.reduce((sum, value) => sum + value, 0);
   const within = total(lasers.map((laser) => squares[laser] - sums[laser] ** 2 / counts[laser]));
-  return within <= SPREAD * (total(squares) - total(sums) ** 2 / ring.length);
+  return within <= ELEVATION_SPREAD * (total(squares) - total(sums) ** 2 / ring.length);
 }
 
-/** Return whether columns can be x, y, z and intensity. Some coordinates are negative; those of lost points not finite. */
+/** Return whether columns can be x, y, z and intensity. Some coordinates are negative; lost points may not be finite. */
 function isKitti([x, y, z, intensity]) {
   const isNear = (i) => Math.abs(x[i]) < NEAR && Math.abs(y[i]) < NEAR && Math.abs(z[i]) < NEAR;
   let usual = 0;
@@ -87,7 +87,7 @@ function isKitti([x, y, z, intensity]) {
     const isLost = !(Number.isFinite(x[i]) && Number.isFinite(y[i]) && Number.isFinite(z[i]));
     if ((isLost || isNear(i)) && isIntensity(intensity[i])) usual++;
   }
-  return [x, y, z].some((axis) => axis.some((value) => value < 0)) && usual >= USUAL * x.length;
+  return [x, y, z].some((axis) => axis.some((value) => value < 0)) && usual >= USUAL_SHARE * x.length;
 }
 
 /** Return whether a value can be an intensity, also of a lost point. */

@@ -1,4 +1,4 @@
-// Reads a scan file: finds its format by the first bytes, or else by the name.
+// Read a scan file; its first bytes or, failing that, its name tell the format.
 
 import { InputError } from "../errors.js";
 import { readPcd } from "./pcd.js";
@@ -10,10 +10,10 @@ const KINDS = {
   ".pcd": { read: readPcd, expected: "a PCD file" },
   ".ply": { read: readPly, expected: "a PLY file" },
 };
-// The first bytes of files.
+// The format of a file by its first bytes: the formats that are read, and others.
 const BEGINNINGS = { "VERSION": ".pcd", "FIELDS": ".pcd", "ply\n": ".ply", "ply\r": ".ply" };
 const OTHERS = { "\x93NUMPY": ".npy", "PK\x03\x04": ".npz", "LASF": ".las", "#ROSBAG": ".bag", "\x89MCAP0": ".mcap" };
-const COMMENTS = /^(?:#[^\n]*\n|\s*\n)+/;  // before the header of a PCD file
+const COMMENTS = /^(?:#[^\n]*\n|\s*\n)+/;  // the lines that may precede the header of a PCD file
 
 /** Return the cloud of a scan file, given its bytes and its name. */
 export function readCloud(bytes, name) {
@@ -23,7 +23,7 @@ export function readCloud(bytes, name) {
   } catch (error) {
     if (error instanceof InputError) throw error;
     const reason = error.message.replace(/\s+/g, " ").slice(0, 160);
-    throw new InputError(`${name}: expected ${kind.expected}, found a broken one (${reason}); write the file again`);
+    throw new InputError(`${name}: expected ${kind.expected}, found a broken file (${reason}); write the file again`);
   }
 }
 
@@ -38,6 +38,6 @@ function endingOf(bytes, name) {
   if (ending) return ending;
   throw new InputError(
     `${name}: expected a scan file (.pcd.bin, ${Object.keys(KINDS).join(", ")}), found another format; ` +
-    "convert it to one, or label it with amvnet predict",
+    "convert it to one of these, or label it with amvnet predict",
   );
 }

@@ -1,4 +1,4 @@
-// Finds the frame of a scan file: its unit, which axis points up, how it is tilted, and how high the sensor is.
+// Find the frame of a scan file: its unit, its axes, its tilt, and the height of the sensor.
 
 import { InputError } from "../errors.js";
 import { findGround } from "./ground.js";
@@ -11,25 +11,26 @@ const AXES = {
   "z-down": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],  // x forward, y right, z down: aircraft
   "y-up": [[0, 0, -1], [-1, 0, 0], [0, 1, 0]],  // x right, y up, z backward: computer graphics
 };
-const UP_AXES = ["z-down", "z-forward", "y-up"];  // to try if no ground is found below
-const UNITS = { m: 1, mm: 0.001 };  // metres
+const UP_AXES = ["z-down", "z-forward", "y-up"];  // the axes to try if no ground is found below
+const UNITS = { m: 1, mm: 0.001 };  // the length of each unit, metres
 
-// The median distance of the points tells the unit: in metres it is 2 to 40 with all sensors.
-const FARTHEST_MEDIAN = 200;  // up to here, the unit is metres
-const LEAST_MILLIMETRES = 4000;  // from here on, millimetres; in between, centimetres or millimetres
-// The origin is near the sensor if near points (5 %) are nearer than this share of far ones (95 %).
+// The median distance of the points tells the unit. In metres, it is 2 to 40 with all sensors. Between the two limits,
+// the unit may be centimetres or millimetres.
+const FARTHEST_MEDIAN = 200;  // the largest median distance of a scan in metres
+const LEAST_MILLIMETRES = 4000;  // the least median distance of a scan in millimetres
+// The largest ratio of near distances (quantile 0.05) to far ones (0.95) of a scan whose origin is near the sensor.
 const AROUND = 0.5;
 
-const SAME_TILT = 3.5;  // degrees: roads slope by up to 3.1 as seen from the cars of the datasets
-const SAME_HEIGHT = 0.15;  // metres: training moves the sensor up and down by as much
-const LOWEST = 0.3;  // metres: if the origin is lower, it lies on the ground and not at the sensor
-const HIGHEST = 4.5;  // metres: no vehicle carries its sensor higher; the coordinates may be in feet
+const SAME_TILT = 3.5;  // the largest tilt that is kept, degrees; in the datasets, roads slope by up to 3.1
+const SAME_HEIGHT = 0.15;  // the largest difference of height that is kept, metres; the training varies it as much
+const LOWEST = 0.3;  // the least height of a sensor, metres; a lower origin lies on the ground
+const HIGHEST = 4.5;  // the largest height of a sensor on a vehicle, metres; beyond it, the unit may be feet
 
 const degrees = (radians) => (radians * 180) / Math.PI;
 
 /**
- * Return the frame of points (3 n) without lost ones: {unit, axes, pitch, roll, height, tilt}. Pitch and roll in
- * degrees turn the scan level; the height is that of the origin over the ground in metres, null without a ground.
+ * Return the frame {unit, axes, pitch, roll, height, tilt} of points (3 n), none of them lost. A rotation by pitch and
+ * roll, in degrees, levels the scan. The height of the origin over the ground is in metres, or null without a ground.
  */
 export function findFrame(xyz, name) {
   const frame = { unit: unitOf(xyz, name), axes: "x-forward", pitch: 0, roll: 0, height: null, tilt: 0 };
@@ -59,7 +60,7 @@ export function findFrame(xyz, name) {
   return frame;
 }
 
-/** Return points (3 n) in metres and in the package's axes; lost ones become NaN if anything changes. */
+/** Return points (3 n) in metres and in the package's axes; if anything changes, lost points become NaN. */
 export function toLevel(xyz, { unit, axes, pitch, roll }) {
   if (unit === "m" && axes === "x-forward" && !pitch && !roll) return xyz;
   const columns = [0, 1, 2].map((column) => AXES[axes].map((row) => row[column]));
@@ -69,14 +70,14 @@ export function toLevel(xyz, { unit, axes, pitch, roll }) {
   return turned(metres, turn);
 }
 
-/** Return whether the origin of the coordinates lies on the ground, or below. */
+/** Return whether the origin of the coordinates lies on or below the ground. */
 export function isOnGround(frame) {
   return frame.height !== null && frame.height < LOWEST;
 }
 
 /**
- * Return how far to move a scan up, metres: [to bring the sensor to the origin, to bring the ground `usualHeight`
- * below the origin].
+ * Return two distances by which a scan is moved up, metres: the first brings the sensor to the origin, the second
+ * brings the ground to `usualHeight` below the origin.
  */
 export function risesOf(frame, usualHeight) {
   const { height } = frame;
@@ -89,7 +90,7 @@ function dot(a, b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-/** Return the points (3 n) turned by a (3, 3) matrix, float64. */
+/** Return points (3 n) rotated by a (3, 3) matrix, float64. */
 function turned(xyz, turn) {
   const result = new Float64Array(xyz.length);
   for (let i = 0; i < xyz.length; i += 3) {
@@ -115,7 +116,7 @@ function levelling([x, y, z]) {
   return [-degrees(Math.atan2(x, Math.hypot(y, z))), degrees(Math.atan2(y, z))];
 }
 
-/** Tell metres from millimetres by the distances of the points. */
+/** Return the unit, m or mm, given the points (3 n): their distances tell it. */
 function unitOf(xyz, name) {
   if (!xyz.length) return "m";
   const distances = Float64Array.from({ length: xyz.length / 3 }, (_, i) => Math.hypot(...xyz.subarray(3 * i, 3 * i + 3)));
@@ -130,7 +131,7 @@ function unitOf(xyz, name) {
   );
 }
 
-/** Return the axes by which the points have a ground, if only one of UP_AXES does: a wall can look like one. */
+/** Return the one of UP_AXES that gives the points a sure ground; x-forward if several do, as walls look like ground. */
 function axesOf(xyz) {
   const sure = UP_AXES.filter((axes) => findGround(turned(xyz, AXES[axes]))?.isSure);
   return sure.length === 1 ? sure[0] : "x-forward";

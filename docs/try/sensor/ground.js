@@ -1,32 +1,32 @@
-// Finds the ground in a scan: the plane that most of the lowest points around the sensor lie in.
+// Find the ground in a scan: the plane that holds most of the lowest points around the sensor.
 
 import { drawing } from "./statistics.js";
 
-export const NEAREST = 1.0;  // metres: nearer returns are from the vehicle itself
-const CELL = 1.0;  // metres: side of the cells whose lowest points are used
-const RADIUS = 20.0;  // metres: farther points are not used
-const HALF_WEIGHT = 8.0;  // metres: a cell at this distance counts half as much as one at the sensor
-const TRIES = 400;  // planes through three low points each
-const LEAST_AREA = 1.0;  // square metres: twice the area of the triangle between the three points
-const TOLERANCE = 0.1;  // metres between the plane and the points of the ground
-const STEEPEST = 25.0;  // degrees: steeper planes are walls and embankments
-const LEAST_CELLS = 30;
-const LEAST_AGREEMENT = 0.25;  // weighted share of the cells that must lie in the plane
+export const NEAREST = 1.0;  // the least distance of points that are used, metres; the vehicle is nearer
+const CELL = 1.0;  // the side of the cells whose lowest points are used, metres
+const RADIUS = 20.0;  // the largest distance of points that are used, metres
+const HALF_WEIGHT = 8.0;  // the distance at which a cell has half the weight of a cell at the sensor, metres
+const TRIES = 400;  // the number of planes that are tried, each through three low points
+const LEAST_AREA = 1.0;  // the least area of the parallelogram that the three points span, square metres
+const TOLERANCE = 0.1;  // the largest distance from the plane to a point of the ground, metres
+const STEEPEST = 25.0;  // the largest slope of the ground, degrees; walls and embankments are steeper
+const LEAST_CELLS = 30;  // the least number of cells with points
+const LEAST_AGREEMENT = 0.25;  // the least weighted share of the cells that lie in the plane
 
-// Which side of the plane is up: the ground has things on it, and little below it
-const OFF_PLANE = 0.3;  // metres from the plane within which points belong to it, at the sensor
-const CURVED = 0.02;  // metres more for each metre of distance from the sensor
-const MOST_BELOW = 0.1;  // share of the points that may be below the plane, unless more are above it
-const LOWEST = -0.5, HIGHEST = 10.0;  // metres of the origin over the plane; a lower plane must be sure
+// These limits tell which side of the plane is up: things stand on the ground, and there is little below it.
+const OFF_PLANE = 0.3;  // the largest distance from the plane to its points, at the sensor, metres
+const CURVED = 0.02;  // how much this distance grows for each metre from the sensor, metres
+const MOST_BELOW = 0.1;  // the largest share of points below the plane, unless more are above it
+const LOWEST = -0.5, HIGHEST = 10.0;  // the limits of the origin's height, metres; a plane above it must be sure
 
-// When a plane is sure enough to turn a scan by it
-const SURE_AGREEMENT = 0.3;  // weighted share of the cells
-const SURE_CELLS = 40;  // square metres, weighted by their distance
-const SURE_SHARE = 0.2;  // of the points within RADIUS that must lie in the plane
+// These limits tell whether a plane is sure enough to level a scan by it.
+const SURE_AGREEMENT = 0.3;  // the least weighted share of the cells that lie in the plane
+const SURE_CELLS = 40;  // the least area of these cells, weighted by distance, square metres
+const SURE_SHARE = 0.2;  // the least share of the points within RADIUS that lie in the plane
 
 /**
- * Return {up, height, isSure} of the ground of points (3 n: x, y, z in metres), whose z axis points more or less up:
- * its unit normal, metres of the origin over it, and whether it is certain; null if there is none.
+ * Return {up, height, isSure} of the ground in points (3 n: x, y, z in metres) whose z axis points roughly up: the unit
+ * normal of the ground, the height of the origin over it in metres, and whether it is sure; null if there is no ground.
  */
 export function findGround(xyz) {
   const points = [];
@@ -79,7 +79,7 @@ function sides(points, plane) {
   return [above / points.length, below / points.length];
 }
 
-/** Return the lowest point of each cell around the sensor, with its weight: near ones count more. */
+/** Return the lowest point of each cell around the sensor with its weight; near points have more weight. */
 function lowestPoints(points) {
   const lowest = new Map(), cells = (2 * RADIUS) / CELL + 1;
   for (const point of points) {
@@ -90,7 +90,7 @@ function lowestPoints(points) {
   return ascending.map(([, point]) => ({ ...point, weight: 1 / (1 + point.distance / HALF_WEIGHT) }));
 }
 
-/** Return [a, b, c] of the plane z = a x + b y + c that most low points agree with; null if all are too steep. */
+/** Return [a, b, c] of the plane z = a x + b y + c that agrees with most low points; null if all are too steep. */
 function bestPlane(low) {
   const draw = drawing(), ends = [];
   low.reduce((sum, { weight }) => (ends.push(sum + weight), sum + weight), 0);

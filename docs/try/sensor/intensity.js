@@ -1,5 +1,5 @@
-// Brings intensities to the range and the distribution that the weights know. All decisions rest on quantiles, so
-// that a few outliers change nothing.
+// Bring intensities to the range and the distribution that the weights know. All decisions rest on quantiles, so that a
+// few outliers change nothing.
 
 import { counted } from "../errors.js";
 import { measuredIntensities } from "../reading/cloud.js";
@@ -8,17 +8,18 @@ import { drawing, interpolate, quantilesOf } from "./statistics.js";
 // The quantiles at these probabilities describe a distribution of intensities.
 const PROBABILITIES = [0.001, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999];
 const MEDIAN = PROBABILITIES.indexOf(0.5), BRIGHT = PROBABILITIES.indexOf(0.9);
-const DARKEST = 0.004;  // one step of 8 bits: below it, factors mean nothing
-const ALIKE = 2;  // factor by which the median or the bright quantile of two distributions that are alike may differ
-const CONSTANT = 0.01;  // share of the median: if 98 % of the intensities differ by less, they say nothing
+const DARKEST = 0.004;  // the least intensity in a comparison, one step of 8 bits
+const ALIKE = 2;  // the largest ratio of the medians, or of the bright quantiles, of two similar distributions
+// The largest range of 98 % of the intensities, as a share of the median, with which they are constant.
+const CONSTANT = 0.01;
 
-/** Return whether nearly all intensities are the same, so that they say nothing. */
+/** Return whether nearly all intensities are the same. */
 function isConstant(quantiles) {
   const [low, high] = [0.01, 0.99].map((probability) => quantiles[PROBABILITIES.indexOf(probability)]);
   return high - low <= CONSTANT * Math.abs(quantiles[MEDIAN]);
 }
 
-/** Return a function that maps intensities with these quantiles to those of the training. */
+/** Return a function that maps intensities with these quantiles to the distribution of the training. */
 function matching(quantiles, trained) {
   // Equal quantiles, as of many zeros, become the mean of the training's quantiles in their place.
   const levels = [...new Set(quantiles)];
@@ -58,7 +59,7 @@ export function intensityMap(cloud, trained) {
   };
 }
 
-/** Say how many points have an intensity below 0, which counts as 0; empty if none has, or all have. */
+/** Describe how many points have an intensity below 0, which counts as 0; empty if none or all have it. */
 export function negativeText(cloud) {
   const measured = measuredIntensities(cloud), below = measured.findIndex((value) => value >= 0);
   if (below <= 0) return "";
@@ -66,7 +67,7 @@ export function negativeText(cloud) {
   return `intensity ${lowest} in ${counted(below)} of ${counted(measured.length)} points (0 instead)`;
 }
 
-/** Bring the intensities of points (4 n), in place, to the distribution of the training, if this asks for it. */
+/** Bring the intensities of points (4 n) to the distribution of the training, in place, if `trained` asks for it. */
 export function matchIntensity(points, trained) {
   if (!trained?.is_matched) return;
   const quantiles = quantilesOf(points.filter((_, place) => place % 4 === 3).sort(), PROBABILITIES);
@@ -75,7 +76,7 @@ export function matchIntensity(points, trained) {
   for (let i = 3; i < points.length; i += 4) points[i] = matched(points[i]);
 }
 
-/** Return the end of the narrowest usual range of intensities that holds the largest one. */
+/** Return the end of the narrowest usual range of intensities that holds `largest`. */
 function usualScale(largest, isInteger) {
   const ranges = isInteger ? [255, 65535] : [1, 255, 65535];  // integers are not fractions
   return ranges.find((limit) => largest <= limit) ?? largest;
@@ -89,7 +90,7 @@ function areAlike(a, b) {
   });
 }
 
-/** Return intensities for a scan that has none: zeros for networks that learnt to do without, else seeded draws. */
+/** Return intensities for a scan that has none: zeros for networks that do not need them, else seeded random ones. */
 function filler(count, trained) {
   if (!trained || trained.is_optional) return new Float32Array(count);
   const draw = drawing();

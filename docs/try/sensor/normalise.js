@@ -1,4 +1,4 @@
-// Normalises a scan of any sensor to what the weights expect: axes, height, intensities, rows.
+// Normalise a scan of any sensor to what the weights expect: axes, height, intensities, rows.
 
 import { InputError } from "../errors.js";
 import { isPlaced } from "../reading/cloud.js";
@@ -8,15 +8,15 @@ import { intensityMap, matchIntensity, negativeText } from "./intensity.js";
 import { elevationOf, hasEndsOf, rowsOf } from "./rows.js";
 import { quantilesOf } from "./statistics.js";
 
-const FARTHEST = 10_000;  // metres: no LiDAR sees that far
-const LEAST_POINTS = 100;  // fewer say nothing about the sensor
-const SAME_BEAMS = 1.4;  // factor: numbers of lasers are alike if they differ by less
+const FARTHEST = 10_000;  // the limit of coordinates, metres; no LiDAR sees so far
+const LEAST_POINTS = 100;  // the least number of points on which a sensor is measured
+const SAME_BEAMS = 1.4;  // the largest ratio of two numbers of lasers that are alike
 
 /**
- * Return {points, rows, places, text}: the valid points as the weights expect them (4 n: x, y, z in metres, intensity
- * in [0, 1]), their rows in the range image or null, their places in the cloud, and what was assumed, in a line.
+ * Return {points, rows, places, text}. The valid points are normalised (4 n: x, y, z in metres, intensity in [0, 1]).
+ * With them come their rows in the range image, or null, their places in the cloud, and a line on what was assumed.
  *
- * `expected` is what the weights know: {view, sensor, intensity, isAsIs}.
+ * `expected` describes the scans that the weights know: {view, sensor, intensity, isAsIs}.
  */
 export function normalise(cloud, expected) {
   const { name, xyz, count } = cloud, { sensor } = expected;
@@ -36,7 +36,7 @@ export function normalise(cloud, expected) {
   return { count, points: moved, rows, places, text };
 }
 
-/** Return {points, places}: the points (4 n, float32) that are finite and not at the origin, and where they were. */
+/** Return the points (4 n, float32) that are finite and not at the origin, and their places in the cloud. */
 function validPoints(xyz, intensity, name) {
   const count = xyz.length / 3, points = new Float32Array(4 * count), places = new Uint32Array(count);
   let filled = 0, isFar = false;
@@ -113,7 +113,7 @@ function lasersText({ beams, fov_up: top, fov_down: bottom }) {
   return `${count} from ${signed(top, 0)} to ${signed(bottom, 0)} degrees`;
 }
 
-/** Return the end of the line if the weights have not seen such a sensor. */
+/** Return a warning for the end of the line if the weights have not seen such a sensor; else an empty text. */
 function sensorText(lasers, sensor) {
   const ratio = lasers.beams && sensor.beams ? lasers.beams / sensor.beams : 1;
   const isLike = ratio > 1 / SAME_BEAMS && ratio < SAME_BEAMS && hasEndsOf(lasers, sensor);

@@ -13,7 +13,7 @@ export function median(values) {
   return quantilesOf(Float64Array.from(values).sort(), [0.5])[0];
 }
 
-/** Interpolate linearly between points (from, to) with ascending `from`; outside, the ends count. */
+/** Interpolate linearly between points (from, to) with ascending `from`; outside of them, return the value of an end. */
 export function interpolate(value, from, to) {
   if (value <= from[0]) return to[0];
   for (let i = 1; i < from.length; i++) {
@@ -26,7 +26,8 @@ const MULTIPLIER = 0x2360ed051fc65da44385df649fccf645n, BITS = (1n << 128n) - 1n
 
 /** Return a function that draws from [0, 1), with the numbers of NumPy's `default_rng(0)` (PCG64). */
 export function drawing() {
-  const increment = 0x418ddadb3af71a82588133bc447873a9n;  // of seed 0, and so is the state
+  // The increment and the first state of seed 0.
+  const increment = 0x418ddadb3af71a82588133bc447873a9n;
   let state = 0x1aa1b5345996452d09585eb7a69561e3n;
   return () => {
     state = (state * MULTIPLIER + increment) & BITS;

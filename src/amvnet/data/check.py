@@ -1,4 +1,4 @@
-"""Check labelled scans before they are trained on: every label of every scan, in one report."""
+"""Check every label of labelled scans before the training, and report what is wrong."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from amvnet.files import atomic_write
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 
-SHOWN_PROBLEMS = 5  # most unknown ids, or scans, that a message shows
-LARGEST_MEMORY = 200_000_000  # bytes of a file of remembered contents; 20,000 scans need 5 million
+SHOWN_PROBLEMS = 5  # the most unknown ids that a message lists
+# The largest file of remembered contents that is read, bytes. 20,000 scans need 5 million bytes.
+LARGEST_MEMORY = 200_000_000
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,8 @@ class Contents:
     """What a labelled scan holds.
 
     Attributes:
-        valid: valid points (`Scan.valid`).
-        ids: points by raw id.
+        valid: the number of valid points (`Scan.valid`).
+        ids: the number of points by raw id.
     """
 
     valid: int
@@ -40,7 +41,13 @@ class Contents:
 
 @dataclass
 class UnknownId:
-    """A raw id that is neither in a class nor ignored."""
+    """How often a raw id occurs that is neither in a class nor ignored.
+
+    Attributes:
+        points: the number of points with this id.
+        scans: the number of scans with such a point.
+        example: a file with such a point.
+    """
 
     points: int = 0
     scans: int = 0
@@ -52,12 +59,12 @@ class SplitReport:
     """What the scans of a split hold.
 
     Attributes:
+        points: (K + 1,) the number of points by train id.
+        scans_with: (K + 1,) the number of scans with a point of each train id.
         scans: the names of the labelled scans that could be read.
         unlabelled: the names of the scans without a label file, which are skipped.
-        broken: messages by the name of the scan.
-        points: (K + 1,) points by train id.
-        scans_with: (K + 1,) scans with a point of each train id.
-        unknown: by raw id.
+        broken: the messages about broken scans, by the name of the scan.
+        unknown: how often each unknown raw id occurs.
     """
 
     points: np.ndarray
@@ -68,9 +75,11 @@ class SplitReport:
     unknown: dict[int, UnknownId] = field(default_factory=dict)
 
     def add(self, record: ScanRecord, contents: Contents, lookup: np.ndarray) -> None:
-        """Count a scan.
+        """Add the points of a scan to the counts.
 
         Args:
+            record: the scan.
+            contents: what it holds.
             lookup: train ids by raw id; UNKNOWN for raw ids that are not expected.
         """
         self.scans.append(record.name)
@@ -93,8 +102,10 @@ class Report:
     """What the labelled scans of a dataset hold, by split.
 
     Attributes:
-        spec: the text by which the dataset is opened.
-        contents: by the name of the scan; broken scans are not in it.
+        spec: the text with which the dataset is opened.
+        taxonomy: the classes of the dataset.
+        splits: the report of each split, by the name of the split.
+        contents: what each scan holds, by the name of the scan; broken scans are left out.
         lookup: int16 train ids by raw id (`Dataset.train_ids_by_raw`).
     """
 
@@ -105,7 +116,7 @@ class Report:
     lookup: np.ndarray
 
     def count_points(self, records: Sequence[ScanRecord]) -> np.ndarray:
-        """Return the (K + 1,) int64 points of some of the scans by train id."""
+        """Return the number of points of some of the scans by train id, (K + 1,) int64."""
         counts = np.zeros(self.taxonomy.size + 1, dtype=np.int64)
         for record in records:
             for raw_id, count in self.contents[record.name].ids.items():
@@ -129,7 +140,10 @@ class Report:
         return dict(sorted(total.items()))
 
     def errors(self) -> Iterator[str]:
-        """Yield what must be corrected before a training, but for broken scans."""
+        """Yield a line for each error that must be corrected before a training.
+
+        Broken scans are not among them; `broken` has their messages.
+        """
         if self.taxonomy.size < 2:
             yield (
                 f"{self.spec}: expected two or more classes to train, found only "
@@ -167,7 +181,7 @@ class Report:
                 )
 
     def warnings(self) -> Iterator[str]:
-        """Yield what may be a mistake."""
+        """Yield a line for each thing that may be a mistake."""
         for name, split in self.splits.items():
             if split.unlabelled:
                 total = len(split.unlabelled) + len(split.scans) + len(split.broken)
@@ -190,13 +204,14 @@ def check_scans(
 ) -> Report:
     """Read all labelled scans of some splits, and report what they hold.
 
-    Scans are read by several threads. What was found is remembered in the user's cache as long as
-    the files do not change; the classes may.
+    Several threads read scans. The user's cache remembers what they hold, as long as the files do
+    not change; the classes may change.
 
     Args:
-        splits: the scans by the name of the split; those without labels are only counted.
-        progress: takes the number of this process's scans that are done, and their total.
-        processes: those that share the scans; each returns the report of all.
+        dataset: the dataset.
+        splits: the scans by the name of the split; scans without labels are only counted.
+        progress: called with the number of this process's scans that are done, and their total.
+        processes: the processes that share the scans; each returns the report on all scans.
     """
     labelled = {}
     for records in splits.values():
@@ -235,11 +250,12 @@ def _find_contents(
         records: labelled scans by name.
     """
     memory = Memory(dataset)
-    # The first process remembers for all: others might see what it writes below.
+    # All processes take what the first one recalls: another might already see what is kept below.
     known = processes.gather(memory.recall(list(records.values())))[0]
     found: dict[str, Contents | str] = {**known}
     unread = [record for name, record in records.items() if name not in known]
-    # Before the scans are read: of a file that changes meanwhile, the old content is not kept.
+    # The states are taken before the scans are read, so that contents that change while they are
+    # read are not remembered for the changed file.
     states = {name: _state_of(record) for name, record in records.items()}
     for part in processes.gather(_read_all(dataset, processes.share(unread), progress)):
         found |= part
@@ -251,7 +267,7 @@ def _find_contents(
 
 
 def describe_unknown(raw_id: int, entry: UnknownId) -> str:
-    """Return an unknown id in words: how often it occurs, and in which file."""
+    """Describe how often an unknown id occurs, and in which file."""
     points = f"{entry.points:,} point{'' if entry.points == 1 else 's'}"
     return f"{raw_id} ({points} in {counted(entry.scans, 'scan')}, such as {entry.example})"
 
@@ -272,7 +288,7 @@ def _read_all(
             return _contents_of(dataset, record)
         except InputError as error:
             return str(error)
-        except OSError as error:  # of a network disk
+        except OSError as error:  # for example, a network disk has failed
             return f"{error.filename or record.points_path}: {error.strerror or error}"
 
     found = {}
@@ -302,10 +318,10 @@ def _contents_of(dataset: Dataset, record: ScanRecord) -> Contents:
 
 
 class Memory:
-    """The contents of a dataset's scans in the user's cache, as long as their files do not change.
+    """Remembers in the user's cache what the scans of a dataset hold, until their files change.
 
-    What cannot be read or written there, or what another user can write, is forgotten: it only
-    costs time.
+    If the cache cannot be read or written, or if another user can write it, nothing is remembered.
+    This costs only time.
     """
 
     def __init__(self, dataset: Dataset) -> None:
@@ -333,10 +349,11 @@ class Memory:
         return known
 
     def keep(self, states: Mapping[str, list[list[Any]]], contents: Mapping[str, Contents]) -> None:
-        """Remember the contents of scans, and of those that were recalled.
+        """Remember the contents of scans, in addition to what was recalled.
 
         Args:
             states: what `_state_of` returned before the scans were read, by name.
+            contents: what the scans hold, by name.
         """
         for name, found in contents.items():
             self._entries[name] = (states[name], found.valid, found.ids)
@@ -348,7 +365,7 @@ class Memory:
 
 
 def _state_of(record: ScanRecord) -> list[list[Any]]:
-    """Return what changes with the files of a scan: their paths, sizes and times."""
+    """Return the path, size and time of each file of a scan; they change with the files."""
     state: list[list[Any]] = []
     for path in (record.points_path, record.labels_path):
         stat = path.stat() if path is not None and path.is_file() else None

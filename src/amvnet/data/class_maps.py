@@ -19,11 +19,11 @@ COARSE_NAME = "coarse"
 
 @dataclass(frozen=True)
 class ClassMap:
-    """A map from the classes of any taxonomy, by their names, to the classes of another taxonomy.
+    """A map from the names of classes, of any taxonomy, to the classes of another taxonomy.
 
     Attributes:
         target: the classes of the result.
-        sources: the train id in `target` by the name of the class that becomes it.
+        sources: for each name of a class, the train id in `target` that the class becomes.
     """
 
     target: Taxonomy

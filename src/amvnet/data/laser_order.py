@@ -8,15 +8,16 @@ import numpy as np
 
 from amvnet.scan import Scan
 
-SPREAD = 0.035  # largest mean deviation of one laser's slopes; about 2 degrees
-MIN_POINTS = 64  # least mean number of points of a laser; fewer do not show an order
+# The largest mean deviation of the slopes z / hypot(x, y) of one laser; about 2 degrees.
+SLOPE_SPREAD = 0.035
+MIN_POINTS = 64  # the least mean number of points of a laser; fewer do not show an order
 
 
 def with_lasers(scan: Scan, lasers: int) -> Scan:
     """Return a scan with rings, if it has none and `lasers_by_order` finds them.
 
     Args:
-        lasers: number of lasers of the sensor. If it is 0, the scan is returned unchanged.
+        lasers: the number of lasers of the sensor. If it is 0, the scan is returned unchanged.
     """
     if not lasers or scan.ring is not None:
         return scan
@@ -34,7 +35,7 @@ def lasers_by_order(points: np.ndarray, lasers: int) -> np.ndarray | None:
 
     Args:
         points: (N, 3 or more) x, y, z in metres, in the order of the file.
-        lasers: number of lasers of the sensor.
+        lasers: the number of lasers of the sensor.
     """
     if len(points) < MIN_POINTS * lasers:
         return None
@@ -56,7 +57,7 @@ def lasers_by_order(points: np.ndarray, lasers: int) -> np.ndarray | None:
     sizes = np.diff(starts, append=len(slope))
     means = np.add.reduceat(slope, starts) / sizes
     deviations = np.add.reduceat(np.abs(slope - np.repeat(means, sizes)), starts) / sizes
-    if (np.diff(means) >= 0).any() or deviations.max() > SPREAD:
+    if (np.diff(means) >= 0).any() or deviations.max() > SLOPE_SPREAD:
         return None
 
     ring = np.repeat(np.arange(lasers - 1, -1, -1), sizes)

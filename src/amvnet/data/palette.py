@@ -1,6 +1,6 @@
-"""The colours of all drawings: colours of the classes and of marked points.
+"""The colours of classes and of marked points in all drawings.
 
-Label files carry the official colours. In a picture, some of these look alike, or cannot be seen on
+Label files carry the official colours. Some of these look alike in a picture, or cannot be seen on
 a dark background.
 """
 
@@ -9,9 +9,9 @@ from __future__ import annotations
 from amvnet.data.taxonomy import Color, Taxonomy
 
 WRONG: Color = (255, 64, 54)
-UNCERTAIN: Color = (255, 150, 180)  # unlike the colours of all classes of both benchmarks
+UNCERTAIN: Color = (255, 150, 180)  # no class of either benchmark has a similar colour
 
-# Colours that are drawn instead of official colours that look like the colours of other classes.
+# Colours that replace official colours, where these look like the colours of other classes.
 DRAWN: dict[str, dict[str, Color]] = {
     "semantickitti": {
         "sidewalk": (150, 90, 150),
@@ -28,7 +28,7 @@ DRAWN: dict[str, dict[str, Color]] = {
 
 
 def class_colors(taxonomy: Taxonomy) -> tuple[Color, ...]:
-    """Return the (K + 1) colours of the classes in drawings."""
+    """Return the K + 1 colours of the classes in drawings, RGB in 0..255, by train id."""
     drawn = DRAWN.get(taxonomy.name, {})
     colors = []
     for name, color in zip(taxonomy.names, taxonomy.colors, strict=True):

@@ -1,4 +1,4 @@
-"""The classes of both benchmarks: names, colours, raw ids and splits, in one place."""
+"""The classes of both benchmarks and of users: names, colours, raw ids and splits."""
 
 from __future__ import annotations
 
@@ -21,33 +21,38 @@ from amvnet.errors import InputError, one_line_errors, shown
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
-MOST_CLASSES = 255  # train ids are uint8
-# A user's class without a colour gets one whose hue is far from all earlier hues.
+MOST_CLASSES = 255  # the most classes: train ids are uint8
+# A user's class without a colour gets a hue that is far from all earlier hues. SATURATION and VALUE
+# are in [0, 1]; GOLDEN_ANGLE is the step from one hue to the next, as a share of the hue circle.
 SATURATION = 0.65
 VALUE = 0.95
-GOLDEN_ANGLE = 0.381966  # step from one hue to the next, as a share of the circle of hues
-SHOWN = 5  # most unknown ids or names that an error message lists
-UNKNOWN = -1  # marks raw ids without a train id in lookup tables
+GOLDEN_ANGLE = 0.381966
+SHOWN = 5  # the most unknown ids or names that an error message lists
+UNKNOWN = -1  # the mark of raw ids without a train id in lookup tables
 
 Color = tuple[int, int, int]  # RGB in 0..255
 
 
 @dataclass(frozen=True)
 class Taxonomy:
-    """The classes of one benchmark and how its files number them.
+    """The classes of one benchmark or user, and the ids that files give them.
 
     Attributes:
         name: "semantickitti", "nuscenes", or a name that the user chose.
         classes: K names in the official order; `classes[0]` has train id 1.
         colors: K + 1 RGB triples in 0..255, indexed by train id (0 = ignored).
-        raw_to_train: train ids by raw id (int). If the dataset numbers its categories in a table of
-            its own (nuScenes), train ids by category name (str).
+        raw_to_train: train ids by raw id (int). For nuScenes, which numbers its categories in a
+            table, train ids by category name (str).
         train_to_raw: K + 1 raw ids of prediction files, indexed by train id.
         splits: official sequences of "train", "val" and "test"; empty if the dataset's reader
             defines them.
         counts_absent: whether a class that is in neither the ground truth nor the prediction counts
             as 0 in the mIoU (SemanticKITTI). If not, it is left out of the mIoU (nuScenes).
         ignores_rest: whether labels may have other raw ids; these are ignored.
+
+    Raises:
+        InputError: if there are no or too many classes, a name occurs twice, or an id or a colour
+            is out of range.
     """
 
     name: str
@@ -84,7 +89,7 @@ class Taxonomy:
             self._check(not twice, f"no {kind} twice", twice[:1])
 
     def _check(self, holds: bool, expected: str, found: Any) -> None:
-        """Raise an InputError unless a condition holds: a stranger's file may hold anything."""
+        """Raise an InputError unless a condition holds; a stranger's file may hold anything."""
         if not holds:
             raise InputError(
                 f"taxonomy {self.name}: expected {expected}, found {shown(found)}; "
@@ -204,10 +209,12 @@ def check_classes(source: str, of_data: Taxonomy, of_weights: Taxonomy) -> None:
 
 
 def describe_difference(classes: Sequence[str], others: Sequence[str], of_others: str) -> str:
-    """Return in words how some classes differ from others, by their names.
+    """Describe how some classes differ from others, by their names.
 
     Args:
-        of_others: whose classes the others are, such as "the weights".
+        classes: names of classes.
+        others: other names of classes.
+        of_others: what has the other classes, such as "the weights".
     """
     missing = [name for name in classes if name not in others]
     added = [name for name in others if name not in classes]
@@ -266,7 +273,16 @@ def user_taxonomy(
     raw_to_train: Mapping[int | str, int],
     train_to_raw: Sequence[int],
 ) -> Taxonomy:
-    """Return the taxonomy of a user's classes, given what `class_entries` returned."""
+    """Return the taxonomy of a user's classes.
+
+    Args:
+        name: the name of the taxonomy.
+        entries: the classes, as `class_entries` returned them.
+        raw_to_train, train_to_raw: as in `Taxonomy`.
+
+    Raises:
+        InputError: if `Taxonomy` raises it.
+    """
     return Taxonomy(
         name=f"own-{name}" if name in TAXONOMIES else name,
         classes=tuple(entries),

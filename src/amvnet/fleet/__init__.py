@@ -1,1 +1,1 @@
-"""Millions of scans from object storage, labelled on Ray; needs the extra `fleet`."""
+"""Label millions of scans from object storage on a Ray cluster; needs the extra `fleet`."""

@@ -1,4 +1,4 @@
-"""What the workers of a fleet do: measure the sensors of drives, and label scan files."""
+"""The work of a fleet's workers: measure the sensors of drives, and label scan files."""
 
 from __future__ import annotations
 
@@ -40,27 +40,28 @@ from amvnet.models.methods import Compute
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
 
-TRANSFERS = 8  # files that are read from, or written to, object storage at the same time
-IS_FATAL = pa.field("is_fatal", pa.bool_())  # whether no other scan can be written either
+TRANSFERS = 8  # the number of files that are fetched from object storage at the same time
+# The column that says whether an error concerns all scans, because none can be written.
+IS_FATAL = pa.field("is_fatal", pa.bool_())
 DEFAULTS = Compute()
 
 Row = dict[str, Any]
 
 
 class LabelScans:
-    """Label scan files: for `map_batches` of Ray Data with `batch_format="pyarrow"`.
+    """Labels scan files, as a class for `map_batches` of Ray Data with `batch_format="pyarrow"`.
 
     A batch is a table with a row for each scan and the columns `path`, `name`, `drive` and
-    `estimates`; only the first is needed. The column `estimates` holds what `MeasureSensors` has
-    found out about the drive's sensor; without it, the sensor is measured on the first scans of the
-    drive in the batch. So scans of one drive should follow one another.
+    `estimates`; only `path` is needed. The column `estimates` holds what `MeasureSensors` has
+    measured of the drive's sensor. Without it, the sensor is measured on the first scans of the
+    drive in the batch, so scans of one drive should follow one another.
 
     Args:
-        request: how the scans are labelled, and what is written.
-        out: URL or path of the output folder.
-        compute: the device, and the scans that are computed at the same time; the request has the
-            engine and the precision.
-        batch: scans that go through the networks together.
+        request: how the scans are labelled, and which files are written.
+        out: the URL or the path of the output folder.
+        compute: the device, and the number of scans that are computed at the same time. The engine
+            and the precision are in the request.
+        batch: the number of scans that go through the networks together.
 
     Raises:
         InputError: if this machine lacks the device, or a library for the engine.
@@ -90,7 +91,7 @@ class LabelScans:
         self._digest = hashlib.sha256(digests.encode()).hexdigest()[:16]
 
     def __call__(self, batch: pa.Table) -> pa.Table:
-        """Return the rows of the table of results for the scans of a batch."""
+        """Label the scans of a batch; return their rows in the table of results."""
         rows: list[Row] = []
         scans = [_complete(row) for row in batch.to_pylist()]
         for _, drive in groupby(scans, key=itemgetter("drive")):
@@ -98,7 +99,7 @@ class LabelScans:
         return pa.Table.from_pylist(rows, self._schema)
 
     def _label_or_explain(self, drive: Sequence[Row]) -> list[Row]:
-        """Label scans of one drive; after a fault of a library, one by one to find the scan."""
+        """Label scans of one drive; if a library fails, label them one by one to find the cause."""
         try:
             return self._label(drive)
         except Exception as error:
@@ -108,7 +109,7 @@ class LabelScans:
                     found = f"{type(error).__name__}: {line}"
                     line = f"{_shown_path(drive[0])}: expected a scan, found {found}"
                 return [self._row(drive[0], error=" ".join(line.split()))]
-        # Alone, a scan must still be normalised by the first scans of the drive.
+        # The sensor is measured on the first scans of the drive, even for a scan on its own.
         estimates = drive[0]["estimates"] or measure(drive, self.request)["estimates"]
         rows = []
         for row in drive:
@@ -167,7 +168,7 @@ class LabelScans:
         return self._row(row, labels=labels, points=entry.points, **counts)
 
     def _row(self, row: Row, **values: Any) -> Row:
-        """Return a row of results: what is known of the scan, and some values."""
+        """Return a row of the table of results, with the scan and some values."""
         return {
             "scan": row["name"],
             "drive": without_secrets(row["drive"]),
@@ -180,7 +181,11 @@ class LabelScans:
 
 
 class MeasureSensors:
-    """Measure the sensors of drives on their first scans: for `map_batches`, as `LabelScans`."""
+    """Measures the sensors of drives on their first scans, as a class for `map_batches`.
+
+    Args:
+        request: how the scans are labelled.
+    """
 
     def __init__(self, request: LabellingRequest) -> None:
         self.request = request
@@ -199,12 +204,12 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     assumed: list[str] = []
     reader = _make_reader(request, assumed.append)
     usual = None
-    # What cannot be read is a broken scan when it is labelled.
+    # A scan that cannot be read is reported as broken when it is labelled.
     with suppress(Exception), _fetch(drive, reader, request) as (scans, _):
         assert reader.normaliser is not None
         usual = reader.normaliser.measure(source).usual
         for scan, row in zip(scans, drive, strict=True):
-            with suppress(InputError):  # the line about the first scan that can be read
+            with suppress(InputError):  # the first scan that can be read gives the line
                 scan.load()
                 assumed = [line.replace(str(scan.path), _shown_path(row)) for line in assumed]
                 break
@@ -219,7 +224,7 @@ def _make_reader(request: LabellingRequest, report: Reporter = report_nothing) -
 def _fetch(
     drive: Sequence[Row], reader: FileReader, request: LabellingRequest
 ) -> Iterator[tuple[list[FileScan], Path]]:
-    """Yield the scans of a drive, whose files are fetched ahead, and a temporary folder."""
+    """Yield the scans of a drive and a temporary folder for labels; fetch the files ahead."""
     with (
         temporary_folder() as temporary,
         ThreadPoolExecutor(TRANSFERS) as pool,
@@ -240,7 +245,7 @@ def _read_fetched(fetching: Future[Path], request: LabellingRequest) -> Cloud:
     path = fetching.result()
     ending = ending_of(path)
     if ending in (FOLDER, *BAGS):
-        found = "a recording of several" if ending in BAGS else "a folder"
+        found = "a recording of several scans" if ending in BAGS else "a folder"
         raise InputError(
             f"{path}: expected a file of one scan, found {found}; name the files of scans, or "
             "segment it with amvnet predict"
@@ -249,19 +254,24 @@ def _read_fetched(fetching: Future[Path], request: LabellingRequest) -> Cloud:
 
 
 def _complete(row: Row) -> Row:
-    """Return the row of a scan with all columns; what is not known is empty."""
+    """Return the row of a scan with all columns; unknown values are empty."""
     name = row.get("name") or split_name(Path(row["path"]).name)[0]
     others = {key: row.get(key) or "" for key in ("drive", "estimates")}
     return {"path": row["path"], "name": name, **others}
 
 
 def _shown_path(row: Row) -> str:
-    """Return the URL of a scan to show and to store."""
+    """Return the URL of a scan without credentials, to show and to store."""
     return without_secrets(row["path"])
 
 
 def statistics(result: Segmentation, taxonomy: Taxonomy) -> Row:
-    """Return what the table of results says of the labels of a scan."""
+    """Return the statistics of a scan's labels for the table of results, by column.
+
+    Args:
+        result: the labels of the scan, with ids of the written classes.
+        taxonomy: the written classes.
+    """
     ids = result.labels
     size = taxonomy.size + 1
     counts = np.bincount(ids, minlength=size)

@@ -1,4 +1,4 @@
-"""List the scans of a fleet in tables, with few names in memory at a time."""
+"""List the scans of a fleet in tables; only a few names are in memory at a time."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from amvnet.errors import InputError, reason_of, without_secrets
 from amvnet.fleet.storage import Place
 
 MANIFESTS = (".parquet", ".csv")
-COLUMNS = ("path", "name", "drive")  # of a manifest; only the first is needed
-SCANS = pa.schema([(name, pa.string()) for name in COLUMNS])
-CSV_BYTES = 16 << 20  # read at a time
-LISTED = 65_536  # scans of a folder in a table
+COLUMNS = ("path", "name", "drive")  # the columns of a manifest; only `path` is needed
+SCANS_SCHEMA = pa.schema([(name, pa.string()) for name in COLUMNS])
+CSV_BYTES = 16 << 20  # the bytes of a CSV file that are read at a time
+TABLE_SCANS = 65_536  # the most scans of a folder in one table
 
 
 class NameSet:
-    """A set of names that takes 8 bytes each: it holds their digests, sorted."""
+    """A set of names that takes 8 bytes for each: it holds the sorted digests of the names."""
 
     def __init__(self) -> None:
         self._digests = np.empty(0, np.uint64)
@@ -39,7 +39,7 @@ class NameSet:
         return len(self._digests)
 
     def add(self, names: Sequence[str]) -> NDArray[np.bool_]:
-        """Add many names; return for each, (N,) bool, whether it is new."""
+        """Add names; return (N,) bool, whether each is new."""
         digests = _digests(names)
         is_first = np.zeros(len(names), bool)
         _, first = np.unique(digests, return_index=True)
@@ -49,7 +49,7 @@ class NameSet:
         return is_new
 
     def has(self, names: Sequence[str]) -> NDArray[np.bool_]:
-        """Return for each name, (N,) bool, whether it is in the set."""
+        """Return (N,) bool, whether each name is in the set."""
         return self._has(_digests(names))
 
     def _has(self, digests: NDArray[np.uint64]) -> NDArray[np.bool_]:
@@ -67,20 +67,20 @@ def _digests(names: Sequence[str]) -> NDArray[np.uint64]:
 def list_scans(inputs: Iterable[str], out: Place) -> Iterator[pa.Table]:
     """Yield the scans of the inputs in tables with the columns of a manifest.
 
-    `path` is a URL; `name` is the path of the label file, without an ending, relative to the output
-    folder: equal names are equal paths.
-
-    A drive is a folder, or what the column `drive` of a manifest says. The scans of a folder have
-    the order of their names.
+    The column `path` holds the URL of a scan file. The column `name` holds the path of its label
+    file without the ending, relative to the output folder, so that equal names are equal paths. The
+    column `drive` names the recording: the folder of the file, or the drive in the manifest. The
+    scans of a folder are sorted by name.
 
     Args:
-        inputs: each the URL or the path of a folder of scan files and folders, of a scan file, or
-            of a manifest: a Parquet or CSV file with a row for each scan.
+        inputs: URLs or paths. Each names a scan file, a folder of scan files and folders, or a
+            manifest, which is a Parquet or CSV file with a row for each scan.
         out: the output folder.
 
     Raises:
-        InputError: if an input cannot be reached, is a dataset, has no scan, has recordings of
-            several scans in a file, or if the output folder lies in it, or the other way round.
+        InputError: if an input cannot be reached, is a dataset, has no scan, or has files with
+            several scans; or if an input lies in the output folder, or the output folder in an
+            input.
     """
     for text in inputs:
         if is_dataset(text):
@@ -106,8 +106,8 @@ def _list_input(place: Place, out: Place) -> Iterator[pa.Table]:
     kind = place.kind()
     if kind == FileType.NotFound:
         raise InputError(
-            f"{place.url}: expected scan files, a folder of them or a manifest, found nothing; "
-            "check the URL"
+            f"{place.url}: expected scan files, a folder of scan files or a manifest, found "
+            "nothing; check the URL"
         )
     if kind == FileType.File and place.path.lower().endswith(MANIFESTS):
         check_outside(place, out)
@@ -117,7 +117,7 @@ def _list_input(place: Place, out: Place) -> Iterator[pa.Table]:
         yield from _scans_in(folder, "", [file])
     elif out.is_in(place):
         raise InputError(
-            f"{out.url}: expected a folder outside the inputs, found one in {place.url}; "
+            f"{out.url}: expected a folder outside the inputs, found a folder in {place.url}; "
             "change --out"
         )
     else:
@@ -135,31 +135,31 @@ def check_outside(place: Place, out: Place) -> None:
     """Raise InputError if an input lies in the output folder, where outputs could replace it."""
     if place.is_in(out):
         raise InputError(
-            f"{place.url}: expected an input outside the output folder, found one in {out.url}; "
-            "change the output folder"
+            f"{place.url}: expected an input outside the output folder, found an input in "
+            f"{out.url}; change the output folder"
         )
 
 
 def _scans_in(folder: str, prefix: str, files: Sequence[str]) -> Iterator[pa.Table]:
     """Yield the scans of one folder; files of different formats are different drives."""
-    for start in range(0, len(files), LISTED):
+    for start in range(0, len(files), TABLE_SCANS):
         rows = []
-        for file in files[start : start + LISTED]:
+        for file in files[start : start + TABLE_SCANS]:
             stem, ending = split_name(file)
             if ending in BAGS:
                 raise InputError(
                     f"{without_secrets(folder)}/{file}: expected files of one scan, found a "
-                    "recording of several; segment it with amvnet predict"
+                    "recording of several scans; segment it with amvnet predict"
                 )
             drive = f"{without_secrets(folder)}/*{ending}"
             rows.append(
                 {"path": f"{folder}/{file}", "name": _as_path(prefix + stem), "drive": drive}
             )
-        yield pa.Table.from_pylist(rows, SCANS)
+        yield pa.Table.from_pylist(rows, SCANS_SCHEMA)
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Return a file's name without its ending, as `predict` names labels, and the ending.
+    """Return a file's name without its ending, which names its labels, and the ending.
 
     The ending of a packed file includes the ending of the file in it, such as `.bin.gz`.
     """
@@ -172,7 +172,7 @@ def split_name(name: str) -> tuple[str, str]:
 
 
 def _as_path(name: str) -> str:
-    """Return the one spelling of all names of one file: x/a for x//a and ./x/a."""
+    """Return the same spelling for all names of one path, such as x/a for x//a and ./x/a."""
     return posixpath.normpath(name)
 
 
@@ -180,14 +180,14 @@ def _read_manifest(place: Place) -> Iterator[pa.Table]:
     """Yield the scans of a manifest."""
     folder = place.address.rpartition("/")[0]
     for rows in _read_rows(place):
-        yield pa.Table.from_pylist([_resolve(row, folder) for row in rows], SCANS)
+        yield pa.Table.from_pylist([_resolve(row, folder) for row in rows], SCANS_SCHEMA)
 
 
 def _resolve(row: dict[str, Any], folder: str) -> dict[str, str]:
     """Return the URL, the name and the drive of a row.
 
-    A path is relative to the folder of the manifest. The name is the path without its ending; if
-    the path is a URL, only what follows the bucket.
+    A relative path starts at the folder of the manifest. The name is the path without its ending.
+    The name of a URL leaves out the scheme and the bucket.
     """
     path = row["path"]
     _, is_url, _ = path.partition("://")
@@ -223,24 +223,25 @@ def _read_rows(place: Place) -> Iterator[list[dict[str, Any]]]:
             rows = pa.Table.from_batches([batch]).select(names).cast(texts)
             if not all(rows["path"].to_pylist()):
                 raise InputError(
-                    f"{place.url}: expected a path in each row, found a row without; correct it"
+                    f"{place.url}: expected a path in each row, found a row without a path; "
+                    "correct the row"
                 )
             yield rows.to_pylist()
 
 
 def _check_columns(place: Place, names: Sequence[str]) -> list[str]:
-    """Return the columns that are read; raise InputError if one is missing or there twice."""
+    """Return the columns to read; raise InputError if `path` is missing or a column is double."""
     present = [name for name in names if name in COLUMNS]
     if "path" not in present:
         raise InputError(
             f"{place.url}: expected a manifest with a column path, found "
-            f"{', '.join(names)[:200]}; name the column of the scans' files path"
+            f"{', '.join(names)[:200]}; give the column of scan files the name path"
         )
     for name in present:
         if present.count(name) > 1:
             raise InputError(
                 f"{place.url}: expected one column {name}, found {present.count(name)}; "
-                "leave one out"
+                "remove the others"
             )
     return present
 

@@ -1,4 +1,4 @@
-"""The tables of a fleet: results, in parts that also say what is done, and drives."""
+"""Write and read the tables of a fleet: the results of its scans, and its drives."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from amvnet.sensors.frame import Frame
 from amvnet.sensors.lasers import SensorGeometry
 from amvnet.sensors.measure import Estimate
 
-FOLDER = "results"  # in the output folder
-SETTINGS = "run.json"
-DRIVES = "drives.parquet"
-PART = re.compile(r"part-(\d{6})\.parquet")
-PART_BYTES = 64 << 20
-PART_SECONDS = 60.0  # between two parts; a killed driver loses the rows of this time
+FOLDER = "results"  # the folder of the tables in the output folder
+SETTINGS = "run.json"  # the file with the settings of the run
+DRIVES = "drives.parquet"  # the table of drives
+PART = re.compile(r"part-(\d{6})\.parquet")  # the names of the parts of the table of results
+PART_BYTES = 64 << 20  # the size of the rows in memory from which on a part is written, bytes
+PART_SECONDS = 60.0  # the longest time between two parts; a killed run loses as much, seconds
 
 DRIVES_SCHEMA = pa.schema(
     {
         "drive": pa.string(),
         "assumed": pa.string(),
-        "height": pa.float64(),  # metres over the ground
-        "pitch": pa.float64(),  # degrees that turn the scans level
-        "roll": pa.float64(),
-        "estimates": pa.string(),  # JSON
+        "height": pa.float64(),  # of the sensor above the ground, metres
+        "pitch": pa.float64(),  # the rotation that levels the scans, degrees
+        "roll": pa.float64(),  # the rotation that levels the scans, degrees
+        "estimates": pa.string(),  # all measurements, as JSON
     }
 )
 
@@ -56,35 +56,36 @@ def results_schema(taxonomy: Taxonomy) -> pa.Schema:
             "scan": pa.string(),
             "drive": pa.string(),
             "path": pa.string(),
-            "labels": pa.string(),  # URL of the label file
-            "points": pa.int32(),  # valid ones
-            "uncertain": pa.float32(),  # share of the points
+            "labels": pa.string(),  # the URL of the label file
+            "points": pa.int32(),  # the number of valid points
+            "uncertain": pa.float32(),  # the share of uncertain points, in [0, 1]
             "class_points": counts,
             "class_uncertain": counts,
-            "class_confidence": means,  # of the largest score of each point
-            "seconds": pa.float32(),  # of the worker
+            "class_confidence": means,  # the mean of the points' largest scores
+            "seconds": pa.float32(),  # the time that the worker took
             "worker": pa.string(),
-            "weights": pa.string(),  # digest
+            "weights": pa.string(),  # a digest of the weights
             "error": pa.string(),
         }
     )
 
 
 class Results:
-    """The tables in an output folder: `results/part-000000.parquet` and so on, and the drives.
+    """The table of results in an output folder, and the table of drives.
 
-    A part is written when it is large enough, or after some time. A scan is done if a part has it
-    without an error, and its label file exists. The rows of other scans are removed when a run is
-    resumed, so that each scan has one row.
+    The table of results has the parts `results/part-000000.parquet` and so on. A part is written
+    when it is large enough, or after some time. A scan is done if a part has its row without an
+    error, and its label file exists. When a run is resumed, the rows of all other scans are
+    removed, so that each scan has one row.
 
     Args:
         out: the output folder.
         request: how the scans are labelled.
-        resume: whether to go on with an earlier run.
+        resume: whether to continue an earlier run.
 
     Attributes:
         done: the names of the scans that an earlier run has done.
-        estimates: for each drive that is measured, its `estimates` from `describe_drive`.
+        estimates: the `estimates` of `describe_drive`, for each drive that is measured.
 
     Raises:
         InputError: if the folder cannot be written or holds something else, or the earlier run had
@@ -99,8 +100,8 @@ class Results:
         self._schema = results_schema(request.taxonomy)
         self._endings = request.endings
         self._pending: list[pa.Table] = []
-        self._last = time.monotonic()  # when the last part was written
-        self._number = 0  # of the next part
+        self._last = time.monotonic()  # the time at which the last part was written
+        self._number = 0  # the number of the next part
 
         place = self.folder / SETTINGS
         if place.kind() != FileType.File:
@@ -110,7 +111,7 @@ class Results:
         if not resume:
             raise InputError(
                 f"{out.url}: expected a new folder, found the results of an earlier run; say "
-                "--resume to go on with it, or change --out"
+                "--resume to continue it, or change --out"
             )
         _check_same(place, request.settings)
         self._remove_unfinished()
@@ -118,10 +119,10 @@ class Results:
         self._take_estimates(self._read_drives())
 
     def read(self) -> Iterator[tuple[Place, pa.Table, np.ndarray]]:
-        """Yield each part with its table, and which of its rows, (N,) bool, are done.
+        """Yield each part, its table, and (N,) bool: whether the scan of each row is done.
 
         Raises:
-            InputError: if a file of the folder is not one of a fleet.
+            InputError: if a file in the folder is no table of a fleet.
         """
         present = NameSet()
         label_ending = self._endings[0]
@@ -135,7 +136,7 @@ class Results:
             yield self.folder / name, table, is_done & present.has(labels)
 
     def _part_names(self) -> list[str]:
-        """Return the names of the parts; raise InputError if there are files of something else."""
+        """Return the names of the parts; raise InputError if there are any other files."""
         files, _ = self.folder.children()
         names = []
         for file in files:
@@ -151,13 +152,13 @@ class Results:
         return names
 
     def _remove_unfinished(self) -> None:
-        """Remove the files on this machine that killed processes have not finished."""
+        """Remove the unfinished files that killed processes have left on this machine."""
         if self.out.local is not None:
             for path in self.out.local.rglob(UNFINISHED_FILES):
                 path.unlink(missing_ok=True)
 
     def _keep_done(self) -> None:
-        """Collect which scans are done, and remove the rows of the others."""
+        """Collect the scans that are done, and remove the rows of all other scans."""
         for place, table, is_done in self.read():
             names = table["scan"].filter(is_done).to_pylist()
             is_done[is_done] = self.done.add(names)
@@ -180,7 +181,7 @@ class Results:
             self.estimates[row["drive"]] = row["estimates"]
 
     def add(self, rows: pa.Table) -> None:
-        """Add rows, and write a part if it is time."""
+        """Add rows; write a part if it is large enough or the last part is old."""
         if len(rows):
             self._pending.append(rows)
         size = sum(table.nbytes for table in self._pending)
@@ -188,7 +189,7 @@ class Results:
             self.flush()
 
     def flush(self) -> None:
-        """Write what has been added."""
+        """Write all rows that have been added."""
         if self._pending:
             table = pa.concat_tables(self._pending)
             _replace(self.folder / f"part-{self._number:06d}.parquet", table)
@@ -198,10 +199,10 @@ class Results:
 
 
 def _read(place: Place, schema: pa.Schema) -> pa.Table:
-    """Return a table with the columns of a schema, the first without nulls.
+    """Read a table that has the columns of a schema, and no null in the first column.
 
     Raises:
-        InputError: if it cannot be read, or has other columns.
+        InputError: if the table cannot be read, or has other columns.
     """
     with reaching(place.url):
         table = pa.parquet.read_table(BytesIO(place.read()))
@@ -224,7 +225,7 @@ def _read(place: Place, schema: pa.Schema) -> pa.Table:
 
 
 def _replace(place: Place, table: pa.Table) -> None:
-    """Write a part with some rows; remove it if there are none."""
+    """Write a table, or remove its file if it has no rows."""
     if not len(table):
         place.remove()
         return
@@ -234,7 +235,7 @@ def _replace(place: Place, table: pa.Table) -> None:
 
 
 def _check_empty(out: Place) -> None:
-    """Raise InputError if a folder has files."""
+    """Raise InputError if a folder is not empty."""
     if out.kind() != FileType.Directory:
         return
     files, folders = out.children()
@@ -248,7 +249,7 @@ def _check_same(place: Place, settings: Mapping[str, Any]) -> None:
     """Raise InputError if the file of an earlier run holds other settings."""
     content = place.read()
     earlier = None
-    with suppress(ValueError, RecursionError):  # no text, no JSON, a number of too many digits
+    with suppress(ValueError, RecursionError):  # no text, no JSON, or a number with too many digits
         earlier = json.loads(content)
     known = earlier if isinstance(earlier, dict) else {}
     check_settings(place.url, settings, earlier=known, advice="change --out")
@@ -267,11 +268,13 @@ def _write_settings(place: Place, settings: Mapping[str, Any]) -> None:
 
 
 def describe_drive(drive: str, assumed: str, usual: Estimate | None) -> dict[str, Any]:
-    """Return the row of a drive in the table of drives, for all workers and later runs.
+    """Return the row of a drive in the table of drives, which all workers and later runs use.
 
     Args:
-        assumed: a line about the first scan.
-        usual: the median of the first scans; None if they cannot be read or have several sensors.
+        drive: the name of the drive.
+        assumed: a line about what was assumed of the sensor.
+        usual: the median of what the first scans show of the sensor; None if they cannot be read,
+            or have several sensors.
     """
     frame = Frame() if usual is None else usual.frame
     values = None if usual is None else dataclasses.asdict(usual)
@@ -286,7 +289,7 @@ def describe_drive(drive: str, assumed: str, usual: Estimate | None) -> dict[str
 
 
 def parse_estimate(text: str) -> Estimate | None:
-    """Return the estimate in a row of a drive."""
+    """Return the estimate that `describe_drive` wrote; None if there was none."""
     values = json.loads(text)
     if values is None:
         return None

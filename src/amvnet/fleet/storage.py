@@ -1,4 +1,4 @@
-"""Files and folders by URL, such as s3://bucket/drive, or by a path."""
+"""Read and write files and folders by their URL, such as s3://bucket/drive, or by their path."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from pyarrow import fs
 from amvnet.errors import CREDENTIALS, InputError, reason_of, without_secrets
 from amvnet.files import atomic_write
 
-# Without it, pyarrow uploads even a small file in three requests.
-OPTIONS = {"s3": "?allow_delayed_open=true"}
+# Options in the URL of a storage, by its scheme. Without this one, pyarrow uploads even a small
+# file in three requests.
+URL_OPTIONS = {"s3": "?allow_delayed_open=true"}
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Place:
     """A file or a folder on this machine or in object storage; it need not exist.
 
     Attributes:
-        address: the URL as the user wrote it, which may hold credentials; or an absolute path.
+        address: the URL that the user wrote, which may hold credentials; or an absolute path.
         filesystem: pyarrow's filesystem that holds the place.
         path: the path in the filesystem.
     """
@@ -49,8 +50,8 @@ class Place:
         bucket, slash, path = rest.rstrip("/").partition("/")
         if "@" not in bucket and CREDENTIALS.search(url):
             raise InputError(
-                f"{without_secrets(url)}: expected a password with / written as %2F, found one "
-                "with /; escape it"
+                f"{without_secrets(url)}: expected a password with %2F in place of /, found a "
+                "password with /; escape it"
             )
         filesystem, root = _open(scheme, bucket)
         return cls(url.rstrip("/"), filesystem, f"{root.rstrip('/')}{slash}{path}")
@@ -60,16 +61,16 @@ class Place:
 
     @property
     def url(self) -> str:
-        """The address to show and to store: without credentials."""
+        """The address without credentials, to show and to store."""
         return without_secrets(self.address)
 
     @property
     def local(self) -> Path | None:
-        """The path, if it is on this machine."""
+        """The path of a place on this machine; None for a place in object storage."""
         return Path(self.path) if isinstance(self.filesystem, fs.LocalFileSystem) else None
 
     def is_in(self, folder: Place) -> bool:
-        """Return whether the place is a folder or lies in it, by its path or after links."""
+        """Return whether the place is a folder or lies in it, also through symbolic links."""
         if self.filesystem.type_name != folder.filesystem.type_name:
             return False
         paths = {(self.path, folder.path)}
@@ -81,7 +82,7 @@ class Place:
         return any(f"{path}/".startswith(f"{parent.rstrip('/')}/") for path, parent in paths)
 
     def kind(self) -> fs.FileType:
-        """Return whether it is a file, a folder or nothing.
+        """Return whether the place is a file, a folder or nothing.
 
         Raises:
             InputError: if the storage cannot be reached.
@@ -90,7 +91,7 @@ class Place:
             return self.filesystem.get_file_info(self.path).type
 
     def children(self) -> tuple[list[str], list[str]]:
-        """Return the sorted names of the files in a folder, and of the folders in it.
+        """Return the sorted names of the files in a folder, and the sorted names of its folders.
 
         Raises:
             InputError: if the folder cannot be listed.
@@ -104,10 +105,14 @@ class Place:
         return sorted(files), sorted(folders)
 
     def walk(self, prefix: str = "") -> Iterator[tuple[str, Place, list[str]]]:
-        """Yield the folder and all folders in it that are not hidden, with their files.
+        """Yield the folder and all folders below it that are not hidden, with their files.
 
-        Each comes with the beginning of the names of its files relative to this folder, such as
-        "drive/", and with their sorted names.
+        Args:
+            prefix: the path of the folder relative to the first one, such as "drive/".
+
+        Yields:
+            The path of a folder relative to the first one, the folder, and the sorted names of its
+            files.
 
         Raises:
             InputError: if a folder cannot be listed.
@@ -119,10 +124,13 @@ class Place:
                 yield from (self / name).walk(f"{prefix}{name}/")
 
     def fetch(self, folder: Path) -> Path:
-        """Return the path of a file on this machine; if it is elsewhere, of a copy in a folder.
+        """Return the path of a file on this machine, or of a copy of a file in object storage.
+
+        Args:
+            folder: the folder for the copy; it is made if it is missing.
 
         Raises:
-            InputError: if it cannot be read.
+            InputError: if the file cannot be read.
         """
         if self.local is not None:
             return self.local
@@ -140,8 +148,8 @@ class Place:
         """Write a file; it appears whole or not at all.
 
         Raises:
-            InputError: if it is on this machine and cannot be written.
-            OSError: if there is no space, or the storage does not take it.
+            InputError: if the file is on this machine and cannot be written.
+            OSError: if there is no space, or the storage does not take the file.
         """
         if self.local is not None:
             with atomic_write(self.local) as part:
@@ -174,12 +182,12 @@ def reaching(url: str) -> Iterator[None]:
 def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
     """Return the filesystem of a bucket and the path of the bucket in it.
 
-    pyarrow has some storages itself; fsspec has the others.
+    pyarrow opens some storages itself, and all others through fsspec.
     """
     root = f"{scheme}://{bucket}"
     shown_root = without_secrets(root)
     with reaching(shown_root), suppress(pa.ArrowInvalid):  # not a scheme of pyarrow
-        uri = f"{root}{OPTIONS.get(scheme, '/')}"
+        uri = f"{root}{URL_OPTIONS.get(scheme, '/')}"
         opened: tuple[fs.FileSystem, str] = fs.FileSystem.from_uri(uri)
         return opened
     try:
@@ -193,5 +201,5 @@ def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
 
 
 def _reason_of(error: BaseException) -> str:
-    """Return `reason_of` an error, without the number that each request has."""
+    """Return the reason of an error, without the number of the request."""
     return without_secrets(reason_of(error)).partition(" (Request ID")[0]

@@ -134,7 +134,7 @@ class Fused(NamedTuple):
     Attributes:
         files: the number of label files.
         uncertain: the share of the points on which the two models disagree, in [0, 1].
-        silent: by side ("a" or "b"), the share of the points of which its model has no opinion, in
+        silent: by side ("a" or "b"), the share of the points without an opinion of its model, in
             [0, 1].
     """
 
@@ -184,7 +184,7 @@ def fuse_files(
     output = replace(output, also_read=[*output.also_read, *scores])
 
     fusion = Fusion(head, tau)
-    silent: Counter[str] = Counter()  # by side, the points of which the model has no opinion
+    silent: Counter[str] = Counter()  # by side, the points without an opinion of the model
 
     def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
         results = []

@@ -53,7 +53,7 @@ SCRIPTS = (
     "point.js",
     "measure.js",
     "edit.js",
-    "hands.js",
+    "pointers.js",
     "page.js",
 )
 

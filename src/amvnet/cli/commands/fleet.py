@@ -44,15 +44,15 @@ def fleet(
     """
     from amvnet.weights.file import load
 
-    on_ray = import_optional("amvnet.fleet.on_ray", "fleet")
+    pipeline = import_optional("amvnet.fleet.pipeline", "fleet")
     choice = ScanChoice(columns=columns, dtype=dtype)
     request = labels.parse(load(weights), choice, known, compute)
     with progress("labelling") as step:
-        written = on_ray.label_fleet(
+        written = pipeline.label_fleet(
             inputs,
             request,
             out,
-            on_ray.Cluster(address, workers, compute, batch),
+            pipeline.Cluster(address, workers, compute, batch),
             resume=resume,
             progress=step,
             report=report,

@@ -15,16 +15,16 @@ from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
 from amvnet.errors import InputError
 
-LISTED = 10  # most topics that an error message lists
+LISTED_TOPICS = 10  # the most topics that an error message lists
 
-CHUNK = 1 << 20  # bytes unpacked at a time
-MIN_MESSAGE = 16  # smallest size of a message in a bag, bytes, even if it is compressed
+CHUNK = 1 << 20  # the bytes that are unpacked at a time
+MIN_MESSAGE = 16  # the smallest size of a message in a bag, even if it is compressed, bytes
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
 
 class Bag:
-    """The scans of one topic of a bag, ordered by time. Only one scan at a time is in memory.
+    """The scans of one topic of a bag, ordered by time; only one scan at a time is in memory.
 
     Args:
         path: the file, or the folder of a ROS 2 bag.
@@ -32,8 +32,8 @@ class Bag:
         topic: the topic of the scans; by default the only topic with PointCloud2.
 
     Raises:
-        InputError: if the bag cannot be read or has no such topic; or if `topic` is None and the
-            bag has several.
+        InputError: if the bag cannot be read, has no such topic, or, without `topic`, has several
+            topics with scans.
     """
 
     def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
@@ -52,7 +52,7 @@ class Bag:
         self._topic = topic
         self._count = count
 
-        # To read messages in order: the index of the next message, and the messages from there on.
+        # Scans are read in order: `_rest` yields the messages from the index `_next` on.
         self._next = 0
         self._rest: Iterator[bytes] = iter(())
 
@@ -123,8 +123,8 @@ def _open_reader(path: Path, ending: str) -> Any:
 def _check_unpacked(folder: Path) -> None:
     """Raise InputError if the compressed files of a bag would fill the disk.
 
-    rosbags unpacks all files when it opens the bag. The process with limits limits only the size of
-    each file.
+    rosbags unpacks all files when it opens the bag, and the limits of the process apply to each
+    file alone.
     """
     from rosbags.rosbag2.reader import zstd
 
@@ -176,6 +176,7 @@ def _choose_topic(connections: Iterable[Any], topic: str | None, path: Path) -> 
     others = [f"{other.topic} ({other.msgtype})" for other in connections]
     raise InputError(
         f"{path}: expected {expected} with PointCloud2, found "
-        f"{', '.join(others[:LISTED]) or 'no topic'}; give a bag with scans, or play this one with "
-        "the driver of the sensor running, and record the PointCloud2 topic that it publishes"
+        f"{', '.join(others[:LISTED_TOPICS]) or 'no topic'}; give a bag with scans, or play this "
+        "bag with the driver of the sensor running, and record the PointCloud2 topic that the "
+        "driver publishes"
     )

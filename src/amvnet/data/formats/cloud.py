@@ -12,17 +12,17 @@ import numpy as np
 from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import FARTHEST, Scan, at_origin
 
-MAX_POINTS = 10_000_000  # most points of a scan: 40 times as many as the largest sensors record
-MAX_BYTES = 32 * MAX_POINTS  # most bytes that the points of a packed file unpack to
-MOST_RINGS = 256  # a column with larger values does not hold ring indices
+MAX_POINTS = 10_000_000  # the most points of a scan: 40 times as many as the largest sensors record
+MAX_BYTES = 32 * MAX_POINTS  # the most bytes to which the points of a packed file unpack
+MOST_RINGS = 256  # the most lasers; a column with larger values does not hold ring indices
 
-# The largest intensity that a sensor can write, as a fraction, in 8 bits or in 16 bits.
+# The largest intensity that a sensor can write: as a fraction, in 8 bits or in 16 bits.
 FLOAT_RANGES = (1.0, 255.0, 65535.0)
 INTEGER_RANGES = (255.0, 65535.0)  # integers are not fractions
-WILD_SHARE = 0.001  # largest share of outliers: intensities above the range of the others
+WILD_SHARE = 0.001  # the largest share of outliers, intensities above the range of all others
 
 Arrays = dict[str, np.ndarray]  # columns (N,) by key
-# The possible names of each column by its key. If a file has several, the first one here is read.
+# The possible names of each column, by its key. If a file has several, the first in order is read.
 Names = Mapping[str, Sequence[str]]
 COLUMN_NAMES: Names = {
     "x": ("x",),
@@ -48,9 +48,9 @@ class Cloud:
 
     Attributes:
         xyz: (N, 3) float32 or float64 coordinates, metres.
-        intensity: (N,) numbers, or None if the file has none.
-        ring: (N,) int64 index of the laser, or None.
-        name: where the scan comes from; messages name it.
+        intensity: (N,) intensities in the file's own range; None if the file has no intensities.
+        ring: (N,) int64 index of the laser; None if the file has no rings.
+        name: the source of the scan, for messages.
         note: what the reader had to assume about the file; empty if it assumed nothing.
     """
 
@@ -83,9 +83,9 @@ class Cloud:
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.
 
-        The divisor is the end of the usual range that holds the largest intensity: 1 (floats only),
-        255 or 65535. If the largest intensity is above all ranges, it is the divisor itself.
-        Outliers (`WILD_SHARE`) are left out.
+        The divisor is the end of the usual range that holds the largest intensity: 1 (only for
+        floats), 255 or 65535. If the largest intensity is above all ranges, it is itself the
+        divisor. Outliers (`WILD_SHARE`) are left out.
         """
         measured = self.measured_intensity()
         if self.intensity is None or measured is None:
@@ -121,7 +121,7 @@ class Cloud:
 
 @np.errstate(over="ignore", invalid="ignore")
 def as_fractions(intensity: np.ndarray, scale: float) -> np.ndarray:
-    """Divide intensities (N,) by a scale and clip them to [0, 1]; NaN if one is not finite."""
+    """Divide intensities (N,) by a scale and clip them to [0, 1]; others than finite become NaN."""
     fractions: np.ndarray = np.clip(intensity / scale, 0, 1)
     is_finite = np.isfinite(intensity)
     return fractions if is_finite.all() else np.where(is_finite, fractions, np.nan)
@@ -137,7 +137,7 @@ def usual_scale(largest: float, is_integer: bool) -> float:
 
 
 def check_usable(points: np.ndarray, source: Path | str) -> np.ndarray:
-    """Return the (N, 4) points of a scan; raise InputError if none of them is valid."""
+    """Return the (N, 4) points of a scan; raise InputError if no point is valid."""
     if not Scan(points).valid.any():
         raise InputError(f"{source}: {_why_unusable(points[:, :3])}")
     return points
@@ -164,7 +164,9 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
     """Return the number of points that a header claims, if it is plausible.
 
     Args:
-        least: the smallest size of a file with so many points, bytes; 0 if unknown.
+        count: the number that the header claims.
+        path: the file, for the message and for its size.
+        least: the smallest size of a file with so many points, bytes; 0 if it is not known.
 
     Raises:
         InputError: if no scan has that many points, or the file is too short for them.
@@ -192,6 +194,7 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
     Readers raise all kinds of exceptions on broken bytes. An InputError passes unchanged.
 
     Args:
+        path: the beginning of the message.
         expected: what was expected in the file, such as "a PCD file".
         advice: what the user can do about it.
 
@@ -201,14 +204,19 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
     def message(error: BaseException) -> str:
         reason = " ".join(str(error).split())[:160] or type(error).__name__
-        return f"{path}: expected {expected}, found a broken one ({reason}); {advice}"
+        return f"{path}: expected {expected}, found a broken file ({reason}); {advice}"
 
     with one_line_errors(message):
         yield
 
 
 def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str, int]:
-    """Return the indices of the wanted columns that a file has, by key; case does not matter."""
+    """Return the indices of the wanted columns that a file has, by key, in any case of letters.
+
+    Args:
+        names: the names of the file's columns, in order.
+        wanted: the possible names of each wanted column, by its key.
+    """
     lower_names = list(map(str.lower, names))
 
     columns = {}
@@ -223,7 +231,7 @@ def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str
 def require_columns(
     names: Sequence[str], path: Path | str, wanted: Names = COLUMN_NAMES
 ) -> dict[str, int]:
-    """Find columns as `find_columns` does; raise InputError if a needed one is missing."""
+    """Find columns as `find_columns` does; raise InputError if a needed column is missing."""
     columns = find_columns(names, wanted)
     if not set(wanted) <= {*columns, *OPTIONAL}:
         expected = []
@@ -271,8 +279,8 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
 def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
     """Return values (N,) as int64 ring indices, with 0 in place of NaN and infinity.
 
-    Return None if there are no values; if all are equal; or if one is negative, too large or not
-    whole.
+    Return None if there are no values, if all are equal, or if one is negative, not whole or at
+    least `MOST_RINGS`.
     """
     if values is None or not len(values):
         return None

@@ -1,4 +1,4 @@
-"""Detect the format of a scan file by its first bytes, or else by its name."""
+"""Detect the format of a scan file from its first bytes or, failing that, from its name."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from amvnet.errors import InputError
 
 TEXT = (".xyz", ".txt", ".csv", ".asc", ".pts")
 BAGS = (".bag", ".mcap", ".db3")
-FOLDER = ""  # stands for an ending if the path is the folder of a ROS 2 bag
-ARCHIVE = ".zip"  # ending of an archive of scan files
+FOLDER = ""  # the ending of a ROS 2 bag that is a folder
+ARCHIVE = ".zip"  # the ending of an archive of scan files
 GZIP = ".gz"  # follows the ending of a compressed scan file
 METADATA = "metadata.yaml"  # a file in the folder of every ROS 2 bag
 # The endings of all files that are read. docs/own_scans.md says what is read from each kind.
@@ -39,12 +39,12 @@ BEGINNINGS = {
     b"ARROW1": ".feather",
     b"\x1f\x8b": GZIP,
 }
-BEGINNING = 4096  # bytes from the start of a file in which its first bytes are looked for
+BEGINNING = 4096  # the bytes at the start of a file that may hold comments and its first bytes
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # may precede the header of a PCD file
 
 
 def ending_of(path: Path) -> str:
-    """Return the ending that a file should have, by its first bytes, or else by its name.
+    """Return the ending that a file should have, from its first bytes or, failing that, its name.
 
     Raises:
         InputError: if neither the bytes nor the name tell the format.
@@ -65,7 +65,7 @@ def ending_of(path: Path) -> str:
     ending = _begins_as(head[:BEGINNING])
     named = named_ending(path)
     if ending is not None:
-        # Archives of NumPy begin as all others: only the name tells.
+        # Archives of NumPy begin like all archives; only the name tells them apart.
         is_archive = ending == ".npz" and named == ARCHIVE
         return ARCHIVE if is_archive else ending
 
@@ -75,14 +75,14 @@ def ending_of(path: Path) -> str:
     if named is None:
         raise InputError(
             f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; convert "
-            "it to one, or play the packets of a sensor with its driver and record PointCloud2 in "
-            "a bag"
+            "it to one of these, or play the packets of a sensor with its driver and record "
+            "PointCloud2 in a bag"
         )
     return named
 
 
 def _begins_as(beginning: bytes) -> str | None:
-    """Return the ending of files with these first bytes; None if unknown."""
+    """Return the ending of files with these first bytes; None if no format has them."""
     without_comments = COMMENT_LINES.sub(b"", beginning, 1)
     for text in (beginning, without_comments):
         for known, ending in BEGINNINGS.items():
@@ -94,7 +94,7 @@ def _begins_as(beginning: bytes) -> str | None:
 def named_ending(path: Path) -> str | None:
     """Return the ending of a file's name if it is one of `ENDINGS`, else None.
 
-    Return `.gz` if the rest of the name belongs to a file of one scan.
+    Return `.gz` if the name without it belongs to a file of one scan.
     """
     name = path.name.lower()
     if name.endswith(GZIP):

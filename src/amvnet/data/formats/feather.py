@@ -1,6 +1,7 @@
-"""Columns of Feather files (Arrow), such as the scans of Argoverse 2, by pyarrow.
+"""Read columns of Feather files (Arrow), such as the scans of Argoverse 2, with pyarrow.
 
-They are read in the process with limits: a file may claim to unpack to any amount of memory.
+A file may claim to unpack to any amount of memory. Files are therefore read in the process with
+limits.
 """
 
 from __future__ import annotations

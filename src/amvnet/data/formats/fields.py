@@ -1,4 +1,4 @@
-"""Read records of numbers with named fields, in text or in binary, as in PCD and PLY files."""
+"""Read records of numbers with named fields from PCD and PLY files, in text or in binary."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from amvnet.data.formats.cloud import Arrays
 from amvnet.errors import InputError
 
-HEADER = 65_536  # longest header of a file, bytes
+HEADER = 65_536  # the longest header of a file, bytes
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Fields:
         columns = [positions[index] for index in chosen.values()]
         table = np.zeros((0, len(columns)))
         lines = islice(filter(bytes.strip, file), count)
-        for first in lines:  # runs at most once; NumPy would warn if there were no lines
+        for first in lines:  # at most one pass; without lines, NumPy would warn
             table = np.loadtxt(chain([first], lines), usecols=columns, comments=None, ndmin=2)
 
         if len(table) < count:

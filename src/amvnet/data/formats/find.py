@@ -30,8 +30,8 @@ from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError, shown
 from amvnet.files import fault_of_name
 
-ANY_FOLDERS = "**"  # stands for any folders in a pattern
-POSE_COLUMNS = 12  # numbers in a line of KITTI's files of poses: a 3 x 4 matrix
+ANY_FOLDERS = "**"  # the part of a pattern that stands for any folders
+POSE_COLUMNS = 12  # the numbers in a line of KITTI's files of poses, a 3 x 4 matrix
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,9 @@ def list_scans(
     scan, and reading this scan raises the error.
 
     Args:
-        topic: the topic in bags; by default the only topic with scans.
-        layout: what the user says about rows of numbers without names.
+        path: a file, a folder or a pattern, as `find_scans` takes it.
+        topic: the topic to read in bags; by default the only one with scans.
+        layout: the names of the columns in files that do not name them.
         is_alone: whether the user names no other path.
 
     Raises:
@@ -155,7 +156,8 @@ def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> li
 def _scans_of_archive(file: Path, name: str, layout: RowLayout) -> list[NamedScan]:
     """Return the scans of an archive; the files of each of its folders are a recording.
 
-    A member whose name no label file may have is a broken scan, named by its number.
+    If no label file may have the name of a member, the member is a broken scan that has a number as
+    its name.
     """
     scans = []
     for index, member in enumerate(list_archive(file)):
@@ -216,16 +218,16 @@ def matching(pattern: Path) -> list[Path]:
     paths: set[Path] = set()
     for top in matching(Path(*parts[:index])) if index else [Path()]:
         for folder in _folders_below(top):
-            # What is before the pattern is a name, whatever characters it has.
+            # The folder is a name, not a pattern, whatever characters it has.
             rest = Path(*parts[index + 1 :]) if parts[index + 1 :] else Path("*")
             paths.update(matching(Path(glob.escape(str(folder))) / rest))
     return sorted(paths)
 
 
 def _folders_below(top: Path) -> list[Path]:
-    """Return a folder and all below it, each once, without hidden ones; links come last.
+    """Return a folder and all folders below it, each once, without hidden folders; links come last.
 
-    A link may lead to a folder that it is in, or that has been listed by its own name.
+    A link may lead to a folder that contains it, or that is listed already.
     """
     seen: set[Path] = set()
     folders = []
@@ -270,7 +272,7 @@ def is_scan_file(path: Path) -> bool:
 
 
 def is_scan_name(name: str) -> bool:
-    """Return whether a name is that of a scan or a bag; false for text files, which vary."""
+    """Return whether a scan or a bag has such a name; false for text files, which hold anything."""
     if name.startswith(".") or name.endswith(".uncertain.npy"):
         return False
     ending = named_ending(Path(name))
@@ -278,7 +280,7 @@ def is_scan_name(name: str) -> bool:
 
 
 def _is_text_scan(path: Path) -> bool:
-    """Return whether a path is a text file of points. A file of poses is not."""
+    """Return whether a path is a text file of points; files of poses are not."""
     is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
     if not is_text or not path.is_file():
         return False

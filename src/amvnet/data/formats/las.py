@@ -15,11 +15,11 @@ from amvnet.errors import InputError
 
 EXPECTED = "a LAS or LAZ file"
 ADVICE = "write the file again"
-CHUNK = 1_000_000  # points read at a time
+CHUNK = 1_000_000  # the points that are read at a time
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some dimensions of all points: x, y and z in metres, others in the file's units.
+    """Read some dimensions of all points: x, y and z in metres, others in the file's own units.
 
     Raises:
         InputError: if the file is not LAS or LAZ, is truncated or lacks a dimension.

@@ -1,4 +1,4 @@
-"""Scans in NumPy files: tables of points, range images and arrays with named columns.
+"""Read scans from NumPy files: tables of points, range images and arrays with named columns.
 
 Nothing is ever unpickled.
 """
@@ -30,20 +30,25 @@ from amvnet.data.formats.cloud import (
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
-# Possible names of the array of points in an archive with several arrays.
+# The possible names of the array of points in an archive with several arrays.
 KEYS = ("points", "positions", "xyz", "scan", "arr_0")
-FEW = 10  # an array with at most this many rows and with more columns is transposed
-MOST_COLUMNS = 200  # most columns of an array without names that are considered
-COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # compressions of NumPy's archives
+# The most rows of an array that is taken for a transposed one, if it has more columns than this.
+TRANSPOSED_ROWS = 10
+MOST_COLUMNS = 200  # the most columns of an array without names that are considered
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the compressions of NumPy's archives
 ADVICE = "save it again with np.save"
 ARCHIVE_ADVICE = "save it again with np.savez"
 
 
 def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read the points of an array file. If the layout names columns, the array has these.
+    """Read the points of an array file.
+
+    Args:
+        path: the file.
+        layout: the names of the columns, if the user states them.
 
     Raises:
-        InputError: if it is not an array of numbers, has an unsuitable shape or is truncated.
+        InputError: if the file holds no array of numbers, has an unsuitable shape or is truncated.
     """
     with reading(path, "a plain NumPy array", ADVICE):
         return _to_cloud(read_array(path), path, layout)
@@ -53,8 +58,11 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read the points of an archive.
 
     The points are the only array, or the array named `points`, `positions` (Open3D), `xyz`, `scan`
-    or `arr_0`. Arrays named `intensity` and `ring` may stand next to it. Or each column is an array
-    of its own, named `x`, `y`, `z` and so on.
+    or `arr_0`. Arrays named `intensity` and `ring` may stand next to it. Or every column is a
+    separate array, named `x`, `y`, `z` and so on.
+
+    Raises:
+        InputError: if the file is no archive of NumPy, is truncated, or holds no points.
     """
     with reading(path, "a NumPy archive", ARCHIVE_ADVICE):
         names = member_names(path)
@@ -129,8 +137,8 @@ def read_array(path: Path, key: str | None = None) -> np.ndarray:
             member = archive.getinfo(f"{name}.npy")
             if member.compress_type not in COMPRESSIONS:
                 raise InputError(
-                    f"{path}: expected an archive of NumPy, found one packed in another way; "
-                    f"{ARCHIVE_ADVICE}"
+                    f"{path}: expected an archive of NumPy, found an archive packed in another "
+                    f"way; {ARCHIVE_ADVICE}"
                 )
             with archive.open(member) as unpacked:
                 return _load(cast(BinaryIO, unpacked), member.file_size, path)
@@ -152,7 +160,7 @@ def _choose_member(names: Sequence[str], path: Path) -> str:
 
 
 def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
-    """Read the array in a file of `size` bytes, if these can hold what its header claims."""
+    """Read the array in a file of `size` bytes, if they can hold what its header claims."""
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
@@ -189,7 +197,7 @@ def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
             f"found {array.dtype} of shape {array.shape}; save such an array"
         )
 
-    if array.shape[0] <= FEW < array.shape[-1]:
+    if array.shape[0] <= TRANSPOSED_ROWS < array.shape[-1]:
         raise InputError(
             f"{path}: expected a row per point, found shape {array.shape}, which is transposed; "
             "save numpy.moveaxis(array, 0, -1)"

@@ -1,7 +1,7 @@
-"""Scan files packed by gzip, and archives (.zip) of scan files.
+"""Read scan files packed by gzip, and archives (.zip) of scan files.
 
-A file is unpacked to a temporary one that only its reader sees, whatever the archive calls it.
-This runs in the process with limits, and reads nothing that is packed twice.
+A file is unpacked into a temporary file that only its reader sees, whatever its name in the archive
+is. This runs in the process with limits, and does not read files that are packed twice.
 """
 
 from __future__ import annotations
@@ -17,20 +17,21 @@ from amvnet.data.formats.cloud import MAX_BYTES, Cloud, reading
 from amvnet.data.formats.detect import ARCHIVE, BAGS, FOLDER, GZIP, TEXT, ending_of, named_ending
 from amvnet.errors import InputError
 
-CHUNK = 1 << 20  # bytes that are unpacked at a time
-MOST_MEMBERS = 100_000  # of an archive
+CHUNK = 1 << 20  # the bytes that are unpacked at a time
+MOST_MEMBERS = 100_000  # the most files in an archive
 GZIPPED = "a scan file packed by gzip"
 ZIPPED = "an archive of scan files (.zip)"
 ADVICE = "copy it again, or unpack it"
 
-Read = Callable[[Path, str], Cloud]  # reads a file of one scan, given its ending
+Read = Callable[[Path, str], Cloud]  # a function that reads a file of one scan, given its ending
 
 
 def read_gzip(path: Path, read: Read) -> Cloud:
     """Read the scan in a file that is packed by gzip.
 
     Raises:
-        InputError: if it is truncated or unpacks to too much, or holds no file of one scan.
+        InputError: if the file is truncated, unpacks to too many bytes, or holds no file of one
+            scan.
     """
     with reading(path, GZIPPED, ADVICE), gzip.open(path) as packed:
         return _read_unpacked(packed, path.name.lower().removesuffix(GZIP), str(path), read)
@@ -46,7 +47,7 @@ def member_names(path: Path) -> list[str]:
             f"{path}: expected at most {MOST_MEMBERS:,} files, found {len(names):,}; unpack it"
         )
     scans = sorted({name for name in names if _is_scan(name)})
-    # As in a folder, a text may be anything if there are other scans.
+    # As in a folder, text files count only if there are no other scans.
     scans = [name for name in scans if named_ending(Path(name)) not in TEXT] or scans
     if not scans:
         raise InputError(f"{path}: expected {ZIPPED}, found no scan in it; {ADVICE}")
@@ -76,11 +77,13 @@ def _is_scan(name: str) -> bool:
 
 
 def _read_unpacked(packed: IO[bytes] | gzip.GzipFile, name: str, title: str, read: Read) -> Cloud:
-    """Unpack a file to a temporary one, and read it.
+    """Unpack a file into a temporary file, and read it.
 
     Args:
-        name: the file's own name, for its ending alone.
-        title: names the file in messages.
+        packed: the packed file.
+        name: the file's own name; only its ending is used.
+        title: the name of the file in messages.
+        read: reads the temporary file.
     """
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"scan{named_ending(Path(name)) or ''}"
@@ -96,7 +99,7 @@ def _read_unpacked(packed: IO[bytes] | gzip.GzipFile, name: str, title: str, rea
 
 
 def _unpack(packed: IO[bytes] | gzip.GzipFile, path: Path, title: str) -> None:
-    """Unpack a file; raise InputError if it has more bytes than a scan."""
+    """Unpack a file; raise InputError if it has more bytes than any scan."""
     size = 0
     with path.open("wb") as file:
         while chunk := packed.read(CHUNK):

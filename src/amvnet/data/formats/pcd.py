@@ -33,13 +33,14 @@ TYPES = {
     "U": {1: "<u1", 2: "<u2", 4: "<u4", 8: "<u8"},
 }
 
-# LZF packs at most this repetition into a code of this size; no data pack more tightly.
-LONGEST_REPETITION = 264  # bytes
-REPETITION_CODE = 3  # bytes
+# LZF packs at most LONGEST_REPETITION bytes into a code of REPETITION_CODE bytes. No data can be
+# packed more tightly.
+LONGEST_REPETITION = 264
+REPETITION_CODE = 3
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some fields of all points. If a field has several values, only the first is read.
+    """Read some fields of all points; if a field has several values, read only the first.
 
     The points of an organised cloud (a grid) come row by row.
 
@@ -54,7 +55,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         encoding = entries["DATA"][0].lower()
 
         if encoding == "ascii":
-            # Each value takes at least one character; one more stands between any two values.
+            # Each value takes at least one character, and another character separates two values.
             check_point_count(points, path, 2 * sum(fields.counts) * points - 1)
             return fields.read_text(file, points, chosen, path)
 

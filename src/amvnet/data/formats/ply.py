@@ -34,10 +34,10 @@ class Element:
     """One element of a file, such as `vertex`.
 
     Attributes:
-        name: the element's name.
-        count: its number of rows.
-        properties: the names of its properties.
-        types: their types; "list" for a list.
+        name: the name of the element.
+        count: the number of rows.
+        properties: the names of the properties.
+        types: the types of the properties; "list" for a list.
     """
 
     name: str
@@ -71,8 +71,8 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         fields = vertex.fields(BYTE_ORDERS[encoding])
         chosen = require_columns(vertex.properties, path, wanted)
         if encoding == "ascii":
-            # Each value takes at least one character, and so does each line before the vertices.
-            # One more character stands between any two of them.
+            # Each value, and each line before the vertices, takes at least one character. Another
+            # character separates any two of them.
             lines = sum(element.count for element in before)
             least = 2 * (lines + vertex.count * sum(fields.counts)) - 1
             check_point_count(lines + vertex.count, path, least)

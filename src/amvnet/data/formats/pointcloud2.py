@@ -18,14 +18,18 @@ from amvnet.data.formats.cloud import (
 )
 from amvnet.errors import InputError
 
-CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"  # ROS 2's name of the type; rosbags' name for ROS 1 also
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"  # the type in ROS 2; rosbags also has it for ROS 1
 
-# NumPy types by the number that a PointField has for them.
+# NumPy types by their number in a PointField.
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def read_message(message: Any, name: str) -> Cloud:
     """Return the points of a deserialised message, row by row, without the padding.
+
+    Args:
+        message: any object with the attributes of PointCloud2.
+        name: the source of the scan, for messages.
 
     Raises:
         InputError: if x, y or z is missing, or the data are shorter than the message claims.

@@ -1,4 +1,4 @@
-"""Read scan files that are only rows of numbers, such as KITTI's and nuScenes' files."""
+"""Read scan files that hold only rows of numbers, such as KITTI's and nuScenes' files."""
 
 from __future__ import annotations
 
@@ -16,39 +16,40 @@ KITTI_COLUMNS = 4  # x, y, z, intensity
 NUSCENES_COLUMNS = 5  # x, y, z, intensity 0..255, ring
 NUSCENES_ENDING = ".pcd.bin"
 FULL_INTENSITY = 255.0
-XYZ_BYTES = 12  # of rows of nothing but x, y, z
+XYZ_BYTES = 12  # the size of a row that holds only x, y and z as float32, bytes
 KITTI_ROWS = RowLayout(NAMES[:KITTI_COLUMNS])
 NUSCENES_ROWS = RowLayout(NAMES)
 
-WIDEST = 8  # largest size of a number, bytes
-SAMPLE = 400_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # bytes to examine: whole rows of both layouts
-FEW = 4800  # bytes; the values of smaller files may fit any layout
+WIDEST_NUMBER = 8  # the largest size of a number, bytes
+# The bytes of a file that are examined; they hold whole rows of both layouts.
+SAMPLE_BYTES = 400_000 * KITTI_COLUMNS * NUSCENES_COLUMNS
+FEWEST_BYTES = 4800  # the least size of a file whose values can show that no layout fits, bytes
 
 # These limits tell coordinates and intensities from other columns, and float32 from other types.
-MAX_INTENSITY = 65535  # largest intensity that any sensor writes
-NEAR = 500.0  # coordinates of usual scans are smaller, metres
-USUAL = 0.999  # least share of the points that must keep these limits; the others are outliers
-NO_INTENSITY = -1.0  # as some tools write for a lost return; no other intensity is negative
+MAX_INTENSITY = 65535  # the largest intensity that any sensor writes
+NEAR = 500.0  # the limit of coordinates in usual scans, metres
+USUAL_SHARE = 0.999  # the least share of points within these limits; the others are outliers
+NO_INTENSITY = -1.0  # the intensity that some tools write for a lost return; no other is negative
 
 
 def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read rows in the user's layout, or else in KITTI's or nuScenes', whichever the values fit.
+    """Read rows in the user's layout, or in KITTI's or nuScenes' layout, whichever the values fit.
 
-    If a small file fits neither layout, it has nuScenes' layout if its name ends in `.pcd.bin`, and
-    KITTI's otherwise.
+    If the values of a small file fit neither, its name decides: a file `.pcd.bin` has nuScenes'
+    layout, any other file has KITTI's layout.
 
     Raises:
         InputError: if the file is not a whole number of rows, or the values fit neither layout.
     """
     columns = max(len(layout.columns), NUSCENES_COLUMNS)
-    check_point_count(path.stat().st_size // (WIDEST * columns), path)
+    check_point_count(path.stat().st_size // (WIDEST_NUMBER * columns), path)
     data = np.fromfile(path, np.uint8)
     if layout.columns:
         return _to_cloud(data, path, layout)
 
     is_named = path.name.lower().endswith(NUSCENES_ENDING)
     usual = _usual_layout(data, is_named)
-    if usual is None and len(data) >= FEW:
+    if usual is None and len(data) >= FEWEST_BYTES:
         kitti = KITTI_ROWS.record.itemsize
         nuscenes = NUSCENES_ROWS.record.itemsize
         found = "values that fit neither"
@@ -82,7 +83,7 @@ def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
 
 
 def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
-    """Read a file that is only rows of values, as an array (N, columns) of `dtype`.
+    """Read a file that holds only rows of values, as an array (N, columns) of `dtype`.
 
     Raises:
         InputError: if the file is missing, or its size is not a whole number of rows.
@@ -99,7 +100,11 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
 
 
 def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
-    """Return the number of rows that `read_table` would read, by the size of the file."""
+    """Return the number of rows that `read_table` would read, from the size of the file.
+
+    Raises:
+        InputError: if the file is missing, or its size is not a whole number of rows.
+    """
     with readable(path):
         if not path.is_file():
             raise InputError(
@@ -128,11 +133,11 @@ def _usual_layout(data: np.ndarray, is_named: bool) -> RowLayout | None:
         return None
 
     if len(data) % NUSCENES_ROWS.record.itemsize == 0:
-        table = data[:SAMPLE].view(np.float32).reshape(-1, NUSCENES_COLUMNS)
+        table = data[:SAMPLE_BYTES].view(np.float32).reshape(-1, NUSCENES_COLUMNS)
         if _is_nuscenes(table, is_named):
             return NUSCENES_ROWS
     if len(data) % KITTI_ROWS.record.itemsize == 0:
-        table = data[:SAMPLE].view(np.float32).reshape(-1, KITTI_COLUMNS)
+        table = data[:SAMPLE_BYTES].view(np.float32).reshape(-1, KITTI_COLUMNS)
         if _is_kitti(table):
             return KITTI_ROWS
     return None
@@ -141,8 +146,9 @@ def _usual_layout(data: np.ndarray, is_named: bool) -> RowLayout | None:
 def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     """Return whether values (N, 5) can be x, y, z, intensity and ring.
 
-    Rings are whole numbers, at least two different ones; coordinates are not all whole. Intensities
-    are never negative. If not `is_named`, the rings must also not look like labels.
+    Rings are whole numbers, and there are at least two different rings. Some coordinates are not
+    whole. Intensities are never negative. Unless the file's name tells the layout (`is_named`), the
+    rings must also not look like labels.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]
@@ -158,20 +164,20 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
 def _is_kitti(table: np.ndarray) -> bool:
     """Return whether values (N, 4) can be x, y, z and intensity.
 
-    Intensities are never negative, but some coordinates are. Values of lost points may not be
-    finite.
+    Intensities are never negative, but some coordinates are. Lost points may have values that are
+    not finite.
     """
     # Each column is checked alone: a reduction over rows of three takes several times as long.
     x, y, z, intensity = np.ascontiguousarray(table.T)
     is_usual = _are_near(x, y, z) & _are_intensities(intensity)
     is_around = (x < 0).any() or (y < 0).any() or (z < 0).any()
-    return bool(is_around and np.mean(is_usual) >= USUAL)
+    return bool(is_around and np.mean(is_usual) >= USUAL_SHARE)
 
 
 def _are_near(
     x: NDArray[np.floating], y: NDArray[np.floating], z: NDArray[np.floating]
 ) -> NDArray[np.bool_]:
-    """Return (N,) bool: points that are lost, or as near as a sensor sees."""
+    """Return (N,) bool: whether a point is lost, or within the usual reach of a sensor."""
     is_lost = ~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
     is_near = (np.abs(x) < NEAR) & (np.abs(y) < NEAR) & (np.abs(z) < NEAR)
     is_either: NDArray[np.bool_] = is_lost | is_near
@@ -179,7 +185,7 @@ def _are_near(
 
 
 def _are_intensities(values: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return (N,) bool: values that can be intensities, also of lost points."""
+    """Return (N,) bool: whether a value can be an intensity, also of a lost point."""
     is_possible = (values >= 0) & (values <= MAX_INTENSITY)
     is_missing = (values == NO_INTENSITY) | ~np.isfinite(values)
     is_intensity: NDArray[np.bool_] = is_possible | is_missing

@@ -34,15 +34,15 @@ except ImportError:  # Windows has no limits
     resource = None  # type: ignore[assignment]
 
 # The limits grow with the size of the file.
-MEMORY = 700 << 20  # memory of the process for an empty file, bytes
-MEMORY_PER_BYTE = 10  # additional memory for each byte of the file, bytes
-MOST_MEMORY = 4 << 30  # memory of the process for any file, bytes
-SECONDS = 5.0  # processor time for an empty file, seconds
-BYTES_PER_SECOND = 3e6  # bytes of the file for which the process gets an additional second
-DISK = 64 << 20  # size of a temporary file for an empty file, bytes
-DISK_PER_BYTE = 20  # additional size of a temporary file for each byte of the file, bytes
+MEMORY = 700 << 20  # the most memory of the process for an empty file, bytes
+MEMORY_PER_BYTE = 10  # the additional memory for each byte of the file, bytes
+MOST_MEMORY = 4 << 30  # the most memory of the process for any file, bytes
+SECONDS = 5.0  # the most processor time for an empty file, seconds
+BYTES_PER_SECOND = 3e6  # the bytes of the file for which the process gets an additional second
+DISK = 64 << 20  # the largest temporary file for an empty file, bytes
+DISK_PER_BYTE = 20  # the additional size of a temporary file for each byte of the file, bytes
 
-STOP_SECONDS = 0.2  # seconds to wait for the process to end by itself
+STOP_SECONDS = 0.2  # the time in which the process must end by itself, seconds
 ADVICE = "copy the file again, or write it again"
 CODE = f"from {__name__} import serve; serve()"
 
@@ -51,7 +51,7 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
     """Call a function that reads a file, in the process with limits.
 
     Args:
-        function: a function of a module that returns arrays and values that JSON can hold.
+        function: a function of a module, which returns arrays and values that JSON can hold.
         path: the first argument of the function: a file, or a folder of files.
         arguments: the other arguments, which JSON has to hold.
 
@@ -74,13 +74,13 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
 
         try:
             values = _process.exchange(request)
-        except BaseException as error:  # also an interrupt: the next call would get this reply
+        except BaseException as error:  # even an interrupt: the next call would get this reply
             reason = _process.stop()
             _process = None
             if not isinstance(error, (OSError, EOFError)):
                 raise
             raise InputError(
-                f"{path}: expected a file that can be read, found one that {reason}; {ADVICE}"
+                f"{path}: expected a file that can be read, found a file that {reason}; {ADVICE}"
             ) from None
 
     if "error" in values:
@@ -107,8 +107,8 @@ class _Process:
         environment["OMP_NUM_THREADS"] = "1"
         environment["OPENBLAS_NUM_THREADS"] = "1"
 
-        # The process has a session of its own: Ctrl-C reaches only the process that uses it, which
-        # then stops it. If the process that uses it ends, it ends as well.
+        # The process has its own session, so that Ctrl-C reaches only its user, the process that
+        # started it. The user then stops it. If the user ends, the process ends as well.
         self._popen = subprocess.Popen(
             [sys.executable, "-P", "-c", CODE],
             env=environment,
@@ -213,7 +213,7 @@ def _limit(kind: int, value: int) -> None:
     _, hard_limit = resource.getrlimit(kind)
     if hard_limit != resource.RLIM_INFINITY:
         value = min(value, hard_limit)
-    with suppress(ValueError, OSError):  # some systems refuse it
+    with suppress(ValueError, OSError):  # some systems refuse to set a limit
         resource.setrlimit(kind, (value, hard_limit))
 
 

@@ -18,10 +18,10 @@ from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
 from amvnet.errors import InputError, readable
 
-EXTRAS = {"pyarrow": "feather"}  # extra that installs a package; `formats` installs the others
-OPEN_BAGS = 4  # number of bags that the process with limits keeps open
+EXTRAS = {"pyarrow": "feather"}  # the extra that installs a package; by default it is `formats`
+OPEN_BAGS = 4  # the number of bags that the process with limits keeps open
 
-# Readers by the endings of files. The first need to know what rows without names hold; the others
+# Readers by the endings of files. ROW_READERS need the layout of rows without names; COLUMN_READERS
 # read named columns.
 ROW_READERS: dict[str, Callable[[Path, RowLayout], Cloud]] = {
     NUSCENES_ENDING: read_raw,
@@ -54,8 +54,9 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     """Read a file of one scan.
 
     Args:
-        ending: the ending of the format (`ending_of`).
-        layout: what the user says about rows of numbers without names.
+        path: the file.
+        ending: the ending of its format (`ending_of`).
+        layout: the names of the columns in files that do not name them.
 
     Raises:
         InputError: if the file is broken, or needs a package that is missing.
@@ -71,10 +72,12 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
 
 
 def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
-    """Read some columns of a file of points. Each has one number per point, in any shape.
+    """Read some columns of a file of points; each has one number per point, in any shape.
 
     Args:
-        ending: one of `COLUMN_READERS`.
+        path: the file.
+        ending: the ending of its format, one of `COLUMN_READERS`.
+        wanted: the possible names of each column, by its key.
 
     Raises:
         InputError: if the file is broken, lacks a column, or needs a package that is missing.
@@ -99,14 +102,14 @@ def _to_json(layout: RowLayout) -> tuple[list[str], list[str]]:
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
-    """Return a function for each scan of a bag, which reads the scan. Reading in order is fastest.
+    """Return a function for each scan of a bag, which reads the scan; reading in order is fastest.
 
     `Bag` documents the arguments.
 
     Raises:
         InputError: if the bag is broken, has no scan, or needs a package that is missing.
     """
-    bag = (ending, topic, uuid4().hex)  # arguments of `_open`
+    bag = (ending, topic, uuid4().hex)  # the arguments of `_open`
     readers: list[Callable[[], Cloud]] = []
     for index in range(_call(count_scans, path, ending, *bag)["count"]):
         readers.append(partial(_read_scan, path, bag, index))
@@ -119,7 +122,7 @@ def _read_scan(path: Path, bag: tuple[str, str | None, str], index: int) -> Clou
 
 
 def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any) -> Any:
-    """Call a function that reads a file; if it needs packages, in the process with limits."""
+    """Call a function that reads a file; the process with limits runs it if `PACKAGES` says so."""
     if ending not in PACKAGES:
         return function(path, *arguments)
 
@@ -142,7 +145,7 @@ def count_scans(path: Path, *bag: Any) -> dict[str, int]:
 
 
 def read_from_bag(path: Path, index: int, *bag: Any) -> dict[str, Any]:
-    """Return the attributes of a cloud in a bag."""
+    """Return the attributes of the cloud with an index in a bag."""
     return vars(_open(path, *bag).read(index))
 
 
@@ -150,7 +153,7 @@ def read_from_bag(path: Path, index: int, *bag: Any) -> dict[str, Any]:
 def _open(path: Path, ending: str, topic: str | None, _opening: str) -> Bag:
     """Open a bag once for each `_opening`.
 
-    Each call of `open_bag` has another `_opening`, because the file may have changed since the last
+    Each call of `open_bag` has its own `_opening`, because the file may have changed since the last
     call.
     """
     return Bag(path, ending, topic)

@@ -1,4 +1,4 @@
-"""Name the columns of a table without names: as the user says, or in the usual order."""
+"""Name the columns of a table without names, as the user says or in the usual order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from amvnet.data.formats.cloud import Cloud, find_columns, make_cloud, ring_indices
 from amvnet.errors import InputError
 
-NAMES = ("x", "y", "z", "intensity", "ring")  # names of the columns in the usual order
+NAMES = ("x", "y", "z", "intensity", "ring")  # the names of the columns in the usual order
 USUAL_TYPE = "float32"
 ADVICE = "say what the rows hold, for example --columns x,y,z,intensity,ring --dtype float32"
 
@@ -18,9 +18,10 @@ ADVICE = "say what the rows hold, for example --columns x,y,z,intensity,ring --d
 # many points as the mean ring; the largest class has at least 2.8 times as many as the mean class.
 # The variance of the elevations within a ring is at most 0.06 of their variance in the scan; within
 # a class it is at least 0.34.
-UNEVEN = 2.5  # most points of a ring, relative to the mean ring
-FEWEST_LASERS = 8  # with fewer values, classes may also have similar numbers of points
-SPREAD = 0.1  # largest variance of the elevations within a ring, relative to the scan's
+LARGEST_RING = 2.5  # the most points of a ring, relative to the mean ring
+FEWEST_LASERS = 8  # the fewest lasers; fewer classes may also have similar numbers of points
+# The largest variance of the elevations within a ring, relative to their variance in the scan.
+ELEVATION_SPREAD = 0.1
 
 
 def _is_number(dtype: str) -> bool:
@@ -32,16 +33,16 @@ def _is_number(dtype: str) -> bool:
 
 @dataclass(frozen=True)
 class RowLayout:
-    """What the user says about rows of numbers without names.
+    """The layout of rows of numbers without names, as the user states it.
 
     Attributes:
-        columns: the name of each column, in order; empty if unknown. Columns whose names the
-            readers do not know, such as "time" or "_", are not read.
+        columns: the name of each column, in order; empty if the user does not state them. Columns
+            whose names the readers do not know, such as "time" or "_", are not read.
         dtypes: NumPy's names of the types: one for all columns, or one for each column.
 
     Raises:
-        InputError: if a coordinate is missing or named twice; if a type is unknown; or if there are
-            several types, but not one for each column.
+        InputError: if a coordinate is missing or named twice, a type is unknown, or there are
+            several types but not one for each column.
     """
 
     columns: tuple[str, ...] = ()
@@ -59,14 +60,14 @@ class RowLayout:
             if not _is_number(dtype):
                 raise InputError(
                     f"--dtype: expected float32, float64, float16, uint8, ..., found {dtype!a}; "
-                    "give the type of all columns, or one for each with commas"
+                    "give the type of all columns, or a type for each column, with commas"
                 )
 
         is_stated = self.dtypes != (USUAL_TYPE,)
         fits_columns = len(self.dtypes) in (1, len(self.columns))
         if is_stated and not (self.columns and fits_columns):
             raise InputError(
-                f"--dtype: expected --columns, and one type or one for each of them, found "
+                "--dtype: expected --columns, and one type or a type for each column, found "
                 f"{len(self.columns)} columns and {len(self.dtypes)} types; name the columns"
             )
 
@@ -90,7 +91,7 @@ def parse_layout(columns: str | None, dtype: str | None) -> RowLayout:
 
 
 def describe(columns: Sequence[str]) -> str:
-    """Return in words which columns are read, and how many are left out."""
+    """Describe which columns are read, and how many are left out."""
     names = [columns[index] for index in sorted(find_columns(columns).values())]
     text = f"columns {' '.join(names)}"
     more = len(columns) - len(names)
@@ -103,11 +104,13 @@ def named_cloud(
     """Return a cloud from columns (N,) with the names of a `RowLayout`.
 
     Args:
-        name: where the scan comes from.
+        columns: the columns, (N,) each.
+        names: the names of the columns; more columns than names are left out.
+        name: the source of the scan, for messages.
         note: what was assumed about the file.
 
     Raises:
-        InputError: if there are fewer columns than names, or one does not hold numbers.
+        InputError: if there are fewer columns than names, or a column does not hold numbers.
     """
     if len(columns) < len(names):
         raise InputError(
@@ -157,14 +160,15 @@ def are_rings(xyz: np.ndarray, values: np.ndarray) -> bool:
     points = np.bincount(ring)
     lasers = np.count_nonzero(points)
     is_gapless = np.ptp(ring) < 2 * lasers
-    if lasers >= FEWEST_LASERS and is_gapless and points.max() * lasers <= UNEVEN * len(ring):
+    is_even = points.max() * lasers <= LARGEST_RING * len(ring)
+    if lasers >= FEWEST_LASERS and is_gapless and is_even:
         return True
 
     x, y, z = np.where(np.isfinite(xyz).all(axis=1, keepdims=True), xyz, 0).T.astype(np.float64)
     elevation = np.arctan2(z, np.hypot(x, y))
     mean = np.bincount(ring, elevation) / np.maximum(points, 1)
     spread = np.mean((elevation - mean[ring]) ** 2)
-    return bool(spread <= SPREAD * elevation.var())
+    return bool(spread <= ELEVATION_SPREAD * elevation.var())
 
 
 def _split(text: str | None) -> tuple[str, ...]:

@@ -23,19 +23,19 @@ from amvnet.data.formats.cloud import (
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
-HEAD = 65_536  # size of the head of a file, which must hold the first points, bytes
-MOST_COLUMNS = 200  # most columns of a line that are considered
-CHECKED = 20  # number of lines that are checked to have the same columns
-USED = 7  # number of columns that are read if they have no names
-COMMENTS = ("#", "//", "%")  # marks that begin a comment
+HEAD = 65_536  # the size of the head of a file, which must hold the first points, bytes
+MOST_COLUMNS = 200  # the most columns of a line that are considered
+CHECKED_LINES = 20  # the number of lines that are checked to have the same columns
+UNNAMED_COLUMNS = 7  # the number of columns that are read if they have no names
+COMMENTS = ("#", "//", "%")  # the marks that begin a comment
 # Numbers are ASCII; comments and names of columns may be in any encoding.
 ENCODING = "utf-8-sig"
 CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
-# Separators of values, in the order to try. None stands for white space.
+# The separators of values, in the order in which they are tried. None stands for white space.
 SEPARATORS = (";", ",", None)
-# How other programs name coordinates, such as "Points:0" in ParaView and VeloView.
-POINTS = re.compile(r"points?(?:_m_xyz)?[:_](\d)")
-FIRST_RETURN = re.compile(r"([xyz])1")  # ouster-cli writes "X1 (m)"
+# The names of coordinates in other programs, such as "Points:0" in ParaView and VeloView.
+POINTS_NAME = re.compile(r"points?(?:_m_xyz)?[:_](\d)")
+FIRST_RETURN = re.compile(r"([xyz])1")  # a coordinate of the first return: ouster-cli has "X1 (m)"
 UNITS = re.compile(r"\s*[\[(].*$")  # a unit after a name, as in "x [m]"
 EXPECTED = "lines of numbers"
 ADVICE = "write a line x y z intensity per point"
@@ -62,11 +62,12 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read a point from each line.
 
     If a line before the points names the columns, they are found by their names. Otherwise they are
-    x, y, z, intensity and, if its values can be rings, the ring. Values are separated by white
-    space, commas or semicolons.
+    x, y, z and intensity, followed by the ring if its values can be rings. Values are separated by
+    white space, commas or semicolons.
 
     Args:
-        layout: what the user says about the rows; only its columns are used.
+        path: the file.
+        layout: the names of the columns, if the user states them; its types are not used.
 
     Raises:
         InputError: if there are no lines of three or more numbers, or a later line does not have
@@ -86,7 +87,7 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
             values = _read_values(path, table, indices)
             return named_cloud(list(values.T), [names[index] for index in indices], str(path))
 
-        values = _read_values(path, table, range(min(table.count, USED)))
+        values = _read_values(path, table, range(min(table.count, UNNAMED_COLUMNS)))
         names = name_columns(values)
         more = "_" * (table.count - len(names))
         note = describe([*names, *more]) if table.count > 4 else ""
@@ -140,10 +141,10 @@ def _match(lines: list[str], separator: str | None) -> TextTable | None:
     for skipped, line in enumerate(lines):
         values = _split(line, separator)
         if _are_numbers(values, names):
-            points = list(filter(str.strip, lines[skipped : skipped + CHECKED]))
+            points = list(filter(str.strip, lines[skipped : skipped + CHECKED_LINES]))
             # A header has fewer lines than there are points. Other text may end in a line of
             # numbers.
-            if len(points) < min(skipped, CHECKED):
+            if len(points) < min(skipped, CHECKED_LINES):
                 return None
             for point in points:
                 row = _split(point, separator)
@@ -179,7 +180,7 @@ def _clean_name(name: str) -> str:
     first = FIRST_RETURN.fullmatch(bare)
     if first:
         return first[1]
-    match = POINTS.fullmatch(bare)
+    match = POINTS_NAME.fullmatch(bare)
     return "xyz"[int(match[1])] if match and int(match[1]) < 3 else bare
 
 

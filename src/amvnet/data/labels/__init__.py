@@ -1,1 +1,1 @@
-"""Label files of the benchmarks, of other tools and of this package."""
+"""Read and write label files of the benchmarks, of other tools and of this package."""

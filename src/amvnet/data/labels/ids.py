@@ -1,7 +1,7 @@
-"""Files of nothing but the ids of a scan's points, as in both benchmarks.
+"""Read and write files that hold only the ids of a scan's points, as both benchmarks have them.
 
-Errors name what other tools write by mistake: another number type, another byte order, train ids
-instead of raw ids.
+Errors name the likely mistake of another tool: another number type, another byte order, or train
+ids instead of raw ids.
 """
 
 from __future__ import annotations
@@ -15,11 +15,16 @@ from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy
 from amvnet.errors import InputError, errors_of, readable
 from amvnet.files import atomic_write
 
-WIDTHS = (1, 2, 4, 8)  # bytes of the number types that labels are written in by mistake
+WIDTHS = (1, 2, 4, 8)  # the sizes of number types that labels may have by mistake, bytes
 
 
 def read_ids(path: Path, dtype: DTypeLike, count: int) -> np.ndarray:
     """Read the (N,) raw ids of one scan.
+
+    Args:
+        path: the file.
+        dtype: the type of the ids in the file.
+        count: N, the number of points.
 
     Raises:
         InputError: if the file is missing or has another size.
@@ -61,8 +66,14 @@ def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
 def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> None:
     """Check the size of a file of labels; an error names the likely mistake.
 
+    Args:
+        name: the beginning of the message.
+        size: the size of the file, bytes.
+        count: the number of points.
+        dtype: the type of the labels.
+
     Raises:
-        InputError: if the size is not that of `count` labels of `dtype`.
+        InputError: if the file cannot hold `count` labels of `dtype`.
     """
     dtype = np.dtype(dtype)
     if size == count * dtype.itemsize:
@@ -87,17 +98,19 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
 
     Args:
         name: the beginning of the message.
+        raw: (N,) raw ids.
+        taxonomy: the classes.
 
     Raises:
-        InputError: if an id is not one of the raw ids of the taxonomy, or if all of them look like
-            float32 or big-endian ids.
+        InputError: if an id is no raw id of the taxonomy, or all ids look like float32 or
+            big-endian ids.
     """
     with errors_of(name):
         return taxonomy.to_train(check_bits(name, raw))
 
 
 def check_bits(name: Path | str, raw: np.ndarray) -> np.ndarray:
-    """Return (N,) raw ids; raise InputError if all of them look like float32 or big-endian ids."""
+    """Return (N,) raw ids; raise InputError if all look like float32 or big-endian ids."""
     classes = raw.astype(np.uint32) & np.uint32(INSTANCE_MASK)
 
     # The float 40.0 and a big-endian 40 have all of their bits in the upper half.

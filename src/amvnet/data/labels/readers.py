@@ -1,4 +1,4 @@
-"""Read the labels of single scans, from files of labels or scan files."""
+"""Read the labels of single scans from label files or scan files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ from amvnet.data.labels.ids import check_bits, train_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, readable
 
-# Types of the ids in files of nothing but ids, by bytes per point.
+# The types of the ids in files that hold only ids, by bytes per point.
 INTEGERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.int64}
-COLUMNS = ("class", "label", "scalar_class", "scalar_label")  # scalar_*: from CloudCompare
-ARRAYS = ("labels", "label", "class", "arr_0")  # of an archive
-KEY = "labels"  # key of the labels among the columns that a reader returns
+# The usual names of a column of labels; CloudCompare writes names that begin with "scalar_".
+COLUMNS = ("class", "label", "scalar_class", "scalar_label")
+# The usual names of an array of labels in an archive.
+ARRAYS = ("labels", "label", "class", "arr_0")
+KEY = "labels"  # the key of the labels among the columns that a reader returns
 LARGEST_ID = np.iinfo(np.uint32).max
 ADVICE = "write the labels again, one whole number per point"
 
@@ -33,10 +35,13 @@ def read_scan_labels(
     field: str | None = None,
     layout: RowLayout = UNKNOWN,
 ) -> np.ndarray:
-    """Read the (N,) uint8 train ids of a scan, as `read_raw_labels` reads its raw ids.
+    """Read the (N,) uint8 train ids of a scan.
+
+    The arguments are the same as in `read_raw_labels`, and the taxonomy turns raw ids into train
+    ids.
 
     Raises:
-        InputError: as `read_raw_labels`, or if an id is unknown.
+        InputError: if `read_raw_labels` raises it, or an id is unknown.
     """
     raw = read_raw_labels(path, count, field, layout, missing=taxonomy.train_to_raw[0])
     return train_ids(path, raw, taxonomy)
@@ -50,17 +55,18 @@ def read_raw_labels(
     *,
     missing: int,
 ) -> np.ndarray:
-    """Read (N,) raw ids from a file of labels, or from a field of the scan's file, as int64.
+    """Read (N,) int64 raw ids from a label file, or from a field of the scan's file.
 
     Without a field, the ending decides the format: `.npy`, `.npz`, text with a number per line, or
-    the usual column of `.pcd`, `.ply`, `.las`, `.laz`; any other file holds integers of 8, 16, 32
-    or 64 bits and nothing else.
+    the usual column of `.pcd`, `.ply`, `.las` or `.laz`. Any other file holds only integers of 8,
+    16, 32 or 64 bits.
 
     Args:
-        count: the number of points of the scan.
-        field: name of the column; of `.npz`, also of an array next to the points; of arrays and
-            text without names, the number of the column, from 0.
-        layout: of rows without names, what they hold.
+        path: a label file, or with a field, the scan's file.
+        count: N, the number of points of the scan.
+        field: the name of the column. In `.npz`, it may also name an array next to the points. In
+            arrays and text without names, it is the number of the column, from 0.
+        layout: the names of the columns in files that do not name them.
         missing: the raw id for NaN, which CloudCompare writes for points without a label.
 
     Raises:
@@ -98,7 +104,7 @@ def _read_field(path: Path, field: str, layout: RowLayout) -> np.ndarray:
 
 
 def _read_usual(path: Path, count: int) -> np.ndarray:
-    """Read the labels of a file of labels."""
+    """Read a label file in the format that its ending names."""
     ending = path.suffix.lower()
     if ending in TEXT:
         return _read_numbers(path)
@@ -145,7 +151,7 @@ def _check(labels: np.ndarray, path: Path, count: int) -> np.ndarray:
 
 
 def _read_integers(path: Path, count: int) -> np.ndarray:
-    """Read a file of nothing but integers; its size decides their type."""
+    """Read a file that holds only integers; its size decides their type."""
     size = path.stat().st_size
     if count and size % count == 0 and size // count in INTEGERS:
         return np.fromfile(path, dtype=INTEGERS[size // count], count=count)
@@ -166,7 +172,7 @@ def _read_numbers(path: Path) -> np.ndarray:
 
 
 def _read_raw_column(path: Path, layout: RowLayout, field: str) -> np.ndarray:
-    """Read a column of rows of numbers that the user described."""
+    """Read a column from rows of numbers, whose layout the user has described."""
     if not layout.columns:
         raise InputError(
             f"{path}: expected the columns of rows with labels, found none; "

@@ -16,15 +16,16 @@ from amvnet.outputs import Signature
 Kind = Literal["label", "npy", "ply"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
-MAX_ERROR = 0.0005  # metres: if float32 is off by more, coordinates are written as float64
-# No ids begin as files of points do.
+# The largest rounding error of coordinates in float32, metres; if it is larger, they are float64.
+MAX_ERROR = 0.0005
+# The first bytes of a file of ids: they are no first bytes of a scan file.
 _IDS = rb"(?!ply|PK|\x93NUMPY|# \.PCD|VERSION|LASF|#ROSBAG|\x89MCAP|SQLite|\x1f\x8b)"
 _ARRAY = rb"\x93NUMPY.{1,20}'descr': '%s'.{1,40}'shape': \(\d+,\)"
 _PLY = (
     rb"ply\nformat binary_little_endian 1\.0\nelement vertex \d+\nproperty (float|double) x\n.*"
     rb"property uchar red\nproperty uchar green\nproperty uchar blue\nproperty int class\n"
 )
-# What is written for a scan, by the ending: `.bin` is that of nuScenes.
+# The files that are written for a scan, by their ending; nuScenes' label files end in `.bin`.
 SIGNATURES = {
     ".label": Signature("a file of labels", _IDS, unit=4),
     ".bin": Signature("a file of labels", _IDS),
@@ -37,7 +38,7 @@ PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 
 
 def check_kind(kind: str) -> None:
-    """Raise InputError if labels cannot be written in a format. Call this before the work."""
+    """Raise InputError if there is no such format for labels; call this before the work."""
     if kind not in KINDS:
         raise InputError(
             f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them"
@@ -52,24 +53,27 @@ def write_scan_labels(
     taxonomy: Taxonomy,
     uncertain: np.ndarray | None = None,
 ) -> Path:
-    """Write the labels of a scan, one row per point, in the scan's order; return the path.
+    """Write the labels of a scan in the order of its points; return the path.
 
     The file appears whole or not at all. Its formats:
 
-    - `label`: uint32 raw ids only, as in SemanticKITTI.
+    - `label`: only raw ids, uint32, as in SemanticKITTI.
     - `npy`: the same ids as an (N,) array.
     - `ply` (binary): x, y, z, red, green, blue, class (raw id), uncertain (0 or 1). Coordinates are
       float32, or float64 if float32 would be off by more than half a millimetre. NaN stays NaN.
 
     Args:
         stem: the path without an ending; `.` and the kind are added.
-        xyz: (N, 3) coordinates, metres, as in the scan's file. `label` and `npy` use only N.
+        kind: the format, one of `KINDS`.
+        xyz: (N, 3) the unchanged coordinates of the scan's file, metres. `label` and `npy` use
+            only N.
         ids: (N,) train ids in 0..K.
-        uncertain: (N,) bool; None if unknown, which leaves the column out.
+        taxonomy: turns train ids into raw ids and colours.
+        uncertain: (N,) bool; by default, the column is left out.
 
     Raises:
-        InputError: as `check_kind`, or if there is not one id per point, an id is outside 0..K, or
-            the file cannot be written.
+        InputError: if there is no such format, there is not one id per point, an id is outside
+            0..K, or the file cannot be written.
     """
     check_kind(kind)
     path = stem.with_name(f"{stem.name}.{kind}")

@@ -2,18 +2,19 @@
 "use strict";
 
 const FIELD = Math.tan((25 * Math.PI) / 180);  // half the height of the field of view at a distance of 1
-const NEAREST = 0.5, FARTHEST = 1500;
-const LOWEST = 0.03;  // radians: a drag does not take the camera under the ground
-// A drag over the window's height turns by half a circle, and tilts by a quarter: from FIRST, a third of the height
-// brings the camera down to the ground.
+const NEAREST = 0.5, FARTHEST = 1500;  // the limits of the distance from the camera to its target, metres
+const LOWEST = 0.03;  // the least elevation of the camera, which keeps it above the ground, radians
+// The angles of a drag over the window's height, radians. From the view FIRST, a drag over a third of the height tilts
+// the camera down to the ground.
 const TURN = Math.PI, TILT = Math.PI / 2;
+// Views: the position of the camera around its target, in radians and metres.
 const FIRST = { azimuth: 3.6, elevation: 0.55, distance: 46, target: [4, 0, -1] };
 const ABOVE = { azimuth: Math.PI, elevation: Math.PI / 2, distance: 95, target: [0, 0, 0] };
 const STREET = { azimuth: Math.PI, elevation: 0.2, distance: 14, target: [6, 0, -0.5] };
 
 class Camera {
   constructor() {
-    this.middle = [0, 0];  // the target on the screen, in clip space: next to the panel, not behind it
+    this.middle = [0, 0];  // the place of the target on the screen, in clip space; the panel does not cover it
     this.set(FIRST);
   }
 
@@ -44,7 +45,7 @@ class Camera {
     return this.distance + FARTHEST;
   }
 
-  /** Return the (4, 4) matrix from metres to clip space. */
+  /** Return the (4, 4) matrix from metres to clip space, as 16 numbers. */
   matrix(aspect) {
     const { right, up, back } = this.axes();
     const eye = this.target.map((value, axis) => value + this.distance * back[axis]);
@@ -63,21 +64,24 @@ class Camera {
     return out;
   }
 
-  /** Turn around the target; dx and dy are fractions of the window's height. */
+  /** Turn the camera around its target; dx and dy are fractions of the window's height. */
   turn(dx, dy) {
     this.azimuth -= TURN * dx;
     this.elevation += TILT * dy;
     this.clamp();
   }
 
-  /** Move along the screen; dx and dy are fractions of the window's height. */
+  /** Move the scene along the screen; dx and dy are fractions of the window's height. */
   move(dx, dy) {
     const { right, up } = this.axes(), metres = 2 * FIELD * this.distance;
     this.target = this.target.map((value, axis) => value + metres * (dy * up[axis] - dx * right[axis]));
     this.clamp();
   }
 
-  /** Zoom by a factor; the point at (x, y) from the target, in fractions of the window's height, stays in place. */
+  /**
+   * Multiply the distance by a factor. The point at (x, y) relative to the target stays in place; x and y are fractions
+   * of the window's height, to the right and up.
+   */
   zoom(factor, x = 0, y = 0) {
     const before = this.distance;
     this.distance *= factor;

@@ -1,9 +1,9 @@
-// Draws one scan with WebGL 2.
+// Draw one scan with WebGL 2.
 "use strict";
 
 const ATTRIBUTES = { position: 0, intensity: 1, disagreement: 2, label: 3, truth: 4, uncertain: 5 };
-const RINGS = [10, 20, 30, 40, 50], SIDES = 180;
-// The canvas is drawn at up to twice the window's resolution, for smooth edges, up to this number of pixels.
+const RINGS = [10, 20, 30, 40, 50], SIDES = 180;  // the radii of the rings on the ground, metres, and their corners
+// The most pixels of the canvas. For smooth edges, it has up to twice the window's resolution.
 const MOST_PIXELS = 6e6;
 
 class Drawing {
@@ -51,7 +51,7 @@ class Drawing {
     return texture;
   }
 
-  /** Fill a texture of 256 colours. */
+  /** Fill a texture with 256 RGBA colours. */
   fill(unit, bytes) {
     const gl = this.gl;
     gl.activeTexture(gl.TEXTURE0 + unit);
@@ -81,7 +81,7 @@ class Drawing {
     return buffer;
   }
 
-  /** Make the textures that points are drawn to first, so that a shader can read their depth. */
+  /** Make textures for the points. The points are drawn into them first, so that a shader can read the depth. */
   makeTarget() {
     const gl = this.gl;
     this.colors = this.texture(2, null);
@@ -119,14 +119,14 @@ class Drawing {
     return this.uploaded.get(scan.index);
   }
 
-  /** Replace the values of a plane, such as labels that were corrected. */
+  /** Upload the new values of a plane, such as corrected labels. */
   refresh(scan, name) {
     const buffers = this.buffersOf(scan);
     if (buffers[name]) this.gl.deleteBuffer(buffers[name]);
     buffers[name] = this.buffer(scan.planes[name]);
   }
 
-  /** Bind the planes of a scan to the shader's attributes; a missing plane is 0 at every point. */
+  /** Bind the planes of a scan to the shader's attributes; the values of a missing plane are 0. */
   bind(scan, labels) {
     const gl = this.gl, buffers = this.buffersOf(scan);
     gl.bindVertexArray(this.empty);

@@ -1,11 +1,11 @@
-// The box of points that are drawn, and corrections of their labels, which are saved as a label file.
+// Draw only the points in a box, correct their labels, and save the labels as a label file.
 "use strict";
 
-const CORRECTED = "corrected";  // the plane of labels that were corrected
-const HALF = 3;  // metres from the point to the sides of its box
+const CORRECTED = "corrected";  // the plane that holds corrected labels
+const BOX_HALF = 3;  // the distance from a clicked point to the sides of the box around it, metres
 const AXES = ["x", "y", "z"];
 
-/** Return a scan's name as that of a file. */
+/** Return a name for files about a scan: the scan's name without characters that a file name cannot have. */
 function fileNameOf(scan) {
   return scan.name.split("/").at(-1).replace(/[^\w.-]/g, "_") || "scan";
 }
@@ -16,7 +16,7 @@ function saveFile(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
-/** Return the raw ids of a scan's labels, as a .label file has them: uint32, little-endian. */
+/** Return the content of a .label file: the raw ids of a scan's labels, as little-endian uint32. */
 function labelFile(ids, raw) {
   const view = new DataView(new ArrayBuffer(4 * ids.length));
   ids.forEach((id, i) => view.setUint32(4 * i, raw[id], true));
@@ -25,8 +25,8 @@ function labelFile(ids, raw) {
 
 class Editor {
   /**
-   * `change` is called with changes of the look, `now` returns {look, scan, chosen}, and `refresh` is called with a
-   * scan and the name of its plane that has new values.
+   * `change` is called with changes of the look. `now` returns {look, scan, chosen}. `refresh` is called with a scan
+   * and the name of a plane that has new values.
    */
   constructor(change, now, refresh) {
     Object.assign(this, { change, now, refresh, before: [] });
@@ -46,7 +46,7 @@ class Editor {
     byId("save").onclick = () => this.save();
   }
 
-  /** Return the box of the inputs; an empty one does not bound. */
+  /** Return the box that the inputs describe; an empty input does not limit it. */
   read() {
     return boxOf(this.inputs.map(({ value }, place) => (value === "" ? NO_BOX[place] : Number(value))));
   }
@@ -55,7 +55,7 @@ class Editor {
     this.inputs.forEach((input, place) => {
       input.value = look.box[place] === NO_BOX[place] ? "" : Number(look.box[place].toFixed(2));
     });
-    // Without the labels of every point, and the ids of files, a label file would not fit the scan.
+    // A label file needs the ids that files have, and a label for every point of the scan.
     byId("edit").hidden = !about.sources.length || !about.raw || Boolean(scan.note);
     byId("undo").disabled = this.before.at(-1)?.scan !== scan;
     byId("save").disabled = !scan.planes[CORRECTED];
@@ -66,7 +66,7 @@ class Editor {
     else this.change({ box: NO_BOX });
   }
 
-  /** Put the box around the point that was clicked. */
+  /** Draw the box around the point that was clicked. */
   surround() {
     const { scan, chosen } = this.now();
     if (chosen < 0) {
@@ -76,11 +76,11 @@ class Editor {
     byId("box").open = true;
     byId("edited").textContent = "";
     const place = placeOf(scan, chosen);
-    const sides = [-HALF, HALF].flatMap((half) => place.map((value) => Number((value + half).toFixed(2))));
+    const sides = [-BOX_HALF, BOX_HALF].flatMap((half) => place.map((value) => Number((value + half).toFixed(2))));
     this.change({ box: sides });
   }
 
-  /** Copy a scan's labels, before they are corrected. */
+  /** Copy a scan's labels to the plane of corrected labels. */
   begin(scan) {
     if (scan.planes[CORRECTED]) return;
     const from = predictions.filter((key) => scan.planes[key]).at(-1) ?? "truth";
@@ -88,7 +88,7 @@ class Editor {
     this.refresh(scan, CORRECTED);
   }
 
-  /** Give all points that are drawn a class. */
+  /** Give a class to all points that are drawn. */
   apply(id) {
     const { look, scan } = this.now(), shown = shownBy(look, scan);
     const points = [...Array(scan.count).keys()].filter(shown);
@@ -102,16 +102,16 @@ class Editor {
     const plane = scan.planes[CORRECTED];
     this.before.push({ scan, points, ids: points.map((i) => plane[i]) });
     for (const i of points) plane[i] = id;
-    this.tell(`${counted(points.length)} points are ${about.classes[id]} now.`, scan);
+    this.report(`${counted(points.length)} points are ${about.classes[id]} now.`, scan);
   }
 
   undo() {
     const { scan, points, ids } = this.before.pop();
     points.forEach((i, place) => { scan.planes[CORRECTED][i] = ids[place]; });
-    this.tell(`${counted(points.length)} points have their label again.`, scan);
+    this.report(`${counted(points.length)} points have their earlier label again.`, scan);
   }
 
-  tell(words, scan) {
+  report(words, scan) {
     this.refresh(scan, CORRECTED);
     byId("edited").textContent = words;
     this.change({ labels: CORRECTED });

@@ -1,8 +1,10 @@
-// What is shown and how. The address keeps it (#color=error&hide=1,2), so that a link shows the same.
+// The look of the page: what it shows and how. The page's address keeps it (#color=error&hide=1,2), so that a link
+// shows the same look.
 "use strict";
 
-const SIZES = [0.4, 4];
-const NO_BOX = [-9999, -9999, -9999, 9999, 9999, 9999];  // metres: x, y, z of the lowest and the highest corner
+const SIZES = [0.4, 4];  // the smallest and the largest size of a point, relative to the usual size
+// The box that holds all points: x, y, z of its lowest and of its highest corner, metres.
+const NO_BOX = [-9999, -9999, -9999, 9999, 9999, 9999];
 const TITLES = { class: "Class", error: "Error", uncertainty: "Uncertainty", height: "Height", intensity: "Intensity" };
 const predictions = about.sources.map((source) => source.key).filter((key) => key !== "truth");
 const has = (plane) => about.scans.some((scan) => scan.planes.includes(plane));
@@ -40,7 +42,7 @@ class Look {
     Object.assign(this, firstLook, { hidden: new Set() });
   }
 
-  /** Apply changes, and correct combinations that would show nothing. */
+  /** Apply changes, and correct combinations that show nothing. */
   set(changes) {
     Object.assign(this, changes);
     if (this.labels === "truth" && (this.color === "error" || this.only === "wrong")) {
@@ -64,15 +66,15 @@ class Look {
     return about.ranges[this.color] ?? [0, 1];
   }
 
-  /** Read the address, with defaults for missing or invalid values; return the camera's numbers. */
+  /** Take the look from the address, with defaults for missing or invalid values; return the camera's numbers. */
   read(hash) {
-    const said = new URLSearchParams(hash.replace(/^#/, ""));
-    const chosen = (name) => (possible[name].includes(said.get(name)) ? said.get(name) : firstLook[name]);
+    const given = new URLSearchParams(hash.replace(/^#/, ""));
+    const chosen = (name) => (possible[name].includes(given.get(name)) ? given.get(name) : firstLook[name]);
     const number = (name, low, high) => {
-      const value = said.has(name) ? Number(said.get(name)) : NaN;
+      const value = given.has(name) ? Number(given.get(name)) : NaN;
       return Number.isFinite(value) ? Math.min(Math.max(value, low), high) : firstLook[name];
     };
-    const ids = (said.get("hide") ?? "").split(",").filter((text) => /^\d+$/.test(text)).map(Number);
+    const ids = (given.get("hide") ?? "").split(",").filter((text) => /^\d+$/.test(text)).map(Number);
     this.hidden = new Set(possible.labels.length ? ids.filter((id) => id < about.classes.length) : []);
     this.labels = chosen("labels");
     this.set({
@@ -80,29 +82,29 @@ class Look {
       color: chosen("color"),
       only: chosen("only"),
       size: number("size", ...SIZES),
-      box: boxOf((said.get("box") ?? "").split(",").map(Number)),
-      shading: said.get("shading") !== "0",
-      rings: said.get("rings") !== "0",
+      box: boxOf((given.get("box") ?? "").split(",").map(Number)),
+      shading: given.get("shading") !== "0",
+      rings: given.get("rings") !== "0",
     });
-    return (said.get("camera") ?? "").split(",").map(Number);
+    return (given.get("camera") ?? "").split(",").map(Number);
   }
 
-  /** Return the address of this look, without values that are the defaults. */
+  /** Return the address of this look; it leaves out default values. */
   hash(camera) {
-    const said = new URLSearchParams();
-    if (this.scan) said.set("scan", this.scan + 1);
+    const values = new URLSearchParams();
+    if (this.scan) values.set("scan", this.scan + 1);
     for (const name of ["color", "labels", "only", "size"]) {
-      if (this[name] !== firstLook[name]) said.set(name, this[name]);
+      if (this[name] !== firstLook[name]) values.set(name, this[name]);
     }
-    if (this.box !== NO_BOX) said.set("box", this.box.join(","));
-    if (this.hidden.size) said.set("hide", [...this.hidden].sort((a, b) => a - b).join(","));
-    for (const name of ["shading", "rings"]) if (!this[name]) said.set(name, "0");
-    said.set("camera", camera.map((value) => Number(value.toFixed(3))).join(","));
-    return "#" + said.toString().replaceAll("%2C", ",");
+    if (this.box !== NO_BOX) values.set("box", this.box.join(","));
+    if (this.hidden.size) values.set("hide", [...this.hidden].sort((a, b) => a - b).join(","));
+    for (const name of ["shading", "rings"]) if (!this[name]) values.set(name, "0");
+    values.set("camera", camera.map((value) => Number(value.toFixed(3))).join(","));
+    return "#" + values.toString().replaceAll("%2C", ",");
   }
 }
 
-/** Return six numbers as a box; none of numbers that are no box. */
+/** Return six numbers as a box; return `NO_BOX` if they are no box. */
 function boxOf(numbers) {
   const whole = numbers.length === 6 && numbers.every(Number.isFinite);
   const box = whole ? numbers.map((value) => Math.min(Math.max(value, NO_BOX[0]), NO_BOX[3])) : NO_BOX;
@@ -111,7 +113,7 @@ function boxOf(numbers) {
 
 const ramps = new Map();
 
-/** Return the 256 colours of a ramp, interpolated between its stops. */
+/** Return the 256 RGBA colours of a ramp, interpolated between its stops. */
 function rampOf(name) {
   if (!ramps.has(name)) {
     const stops = about.ramps[name] ?? [[0, 0, 0]], bytes = new Uint8Array(4 * 256);
@@ -125,7 +127,7 @@ function rampOf(name) {
   return ramps.get(name);
 }
 
-/** Return a function that says whether a point is drawn, by the same rule as the shader. */
+/** Return a function that says whether the point with an index is drawn, by the same rule as the shader. */
 function shownBy(look, scan) {
   const ids = scan.planes[look.labels], { truth, uncertain } = scan.planes, boxed = look.box !== NO_BOX;
   return (i) => {
@@ -140,7 +142,7 @@ function inBox([x, y, z], [x0, y0, z0, x1, y1, z1]) {
   return x >= x0 && x <= x1 && y >= y0 && y <= y1 && z >= z0 && z <= z1;
 }
 
-/** Count the points of each class in a scan, and those that are drawn: {all: [...], drawn: [...]}, by id. */
+/** Count all points and the drawn points of each class in a scan, by id: {all: [...], drawn: [...]}. */
 function tally(look, scan) {
   const ids = scan.planes[look.labels], shown = shownBy(look, scan);
   const all = new Array(about.classes.length).fill(0), drawn = [...all];
@@ -152,7 +154,7 @@ function tally(look, scan) {
   return { all, drawn };
 }
 
-/** Count the points with a true class, and those that the labels give another class: {scored, wrong}. */
+/** Count the points that have a true class, and the points whose label is another class: {scored, wrong}. */
 function errorsOf(scan, labels) {
   const { truth } = scan.planes, ids = scan.planes[labels];
   if (!truth || !ids) return { scored: 0, wrong: 0 };

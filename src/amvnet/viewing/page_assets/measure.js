@@ -1,4 +1,4 @@
-// The measuring tape: the distance between two points that were clicked.
+// The measuring tape shows the distance between two points that were clicked.
 "use strict";
 
 class Tape {
@@ -17,7 +17,7 @@ class Tape {
     this.redraw();
   }
 
-  /** Add a point; a third one begins a new measurement. */
+  /** Add a point; a third point begins a new measurement. */
   add(point) {
     this.ends = this.ends.length === 1 ? [...this.ends, point] : [point];
     this.redraw();

@@ -1,10 +1,10 @@
-// Puts the parts together: one look, one camera, one scan at a time; draws only after a change.
+// Put the parts of the page together: one look, one camera, one scan at a time. The page is drawn only after a change.
 "use strict";
 
 const look = new Look(), camera = new Camera();
-const PAUSE = 800;  // milliseconds between scans during playback
-const GLIDE = 0.04;  // fraction of the window's height that one key press moves
-const STEP = 0.023;  // fraction of the window's height that one key press turns: 4 degrees
+const PLAY_INTERVAL = 800;  // the time between two scans during playback, milliseconds
+const KEY_MOVE = 0.04;  // the movement of one key press, as a fraction of the window's height
+const KEY_TURN = 0.023;  // the turn of one key press, as a fraction of the window's height; 4 degrees
 let drawing, panel, tape, editor, scan = null, chosen = -1, asked = 0, playing = 0, remembering = 0;
 
 function redraw() {
@@ -20,7 +20,7 @@ function draw() {
   tape.draw(scan, camera);
 }
 
-/** Put the ring around the point that was clicked. */
+/** Draw the ring around the point that was clicked. */
 function mark() {
   const marker = byId("marker"), canvas = byId("canvas");
   marker.hidden = byId("point").hidden = chosen < 0;
@@ -53,18 +53,18 @@ async function show() {
   byId("place").textContent = `${wanted + 1} of ${about.scans.length} · ${scan.name}`;
   byId("place").title = scan.name;
   redraw();
-  // For programs that read the page, such as tests.
+  // Programs that read the page, such as tests, find these values.
   Object.assign(document.documentElement.dataset, { drawn: JSON.stringify(drawn), scan: wanted, color: look.color });
 }
 
-/** Save the look in the address, but not at every step of a movement. */
+/** Write the look into the page's address after a movement, not at every step of it. */
 function remember() {
   clearTimeout(remembering);
   const place = [camera.azimuth, camera.elevation, camera.distance, ...camera.target];
   remembering = setTimeout(() => history.replaceState(null, "", look.hash(place)), 250);
 }
 
-/** Restore the look and the camera from the address. */
+/** Restore the look and the camera from the page's address. */
 function recall() {
   const [azimuth, elevation, distance, ...target] = look.read(location.hash);
   const whole = target.length === 3 && [azimuth, elevation, distance, ...target].every(Number.isFinite);
@@ -78,7 +78,7 @@ function moved() {
   remember();
 }
 
-/** Move the camera to a place; farther away if the window is higher than wide. */
+/** Move the camera to a view, and farther away if the window is higher than wide. */
 function stand(place) {
   camera.set({ ...place, distance: place.distance * Math.sqrt(Math.max(1, innerHeight / innerWidth)) });
   moved();
@@ -91,41 +91,41 @@ function step(by) {
 function play() {
   document.body.classList.toggle("playing", !playing);
   clearInterval(playing);
-  playing = playing ? 0 : setInterval(() => step(1), PAUSE);
+  playing = playing ? 0 : setInterval(() => step(1), PLAY_INTERVAL);
 }
 
-function click(x, y, again) {
+function click(x, y, isDouble) {
   const { clientWidth: width, clientHeight: height } = byId("canvas");
   chosen = scan ? pointAt(x, y, scan, look, camera.matrix(width / height), width, height) : -1;
   if (chosen >= 0) describe(chosen, scan);
   if (chosen >= 0 && tape.on) tape.add(chosen);
-  if (chosen >= 0 && again) camera.set({ ...camera, target: placeOf(scan, chosen) });
+  if (chosen >= 0 && isDouble) camera.set({ ...camera, target: placeOf(scan, chosen) });
   moved();
 }
 
-/** Return the next element of a list; after the last comes the first. */
+/** Return the next element of a list; the first follows the last. */
 function next(list, now) {
   return list[(list.indexOf(now) + 1) % list.length];
 }
 
-/** [names of keys, description, function]; a page with one scan leaves out those for several. */
+/** The keys of the page: [names, description, function]. A page with one scan has no keys that change the scan. */
 const KEYS = [
-  [["1", "2", "3", "4", "5"].slice(0, possible.labels.length), "labels, from the first on",
+  [["1", "2", "3", "4", "5"].slice(0, possible.labels.length), "first, second, ... labels",
     (key) => change({ labels: possible.labels[Number(key) - 1] })],
   [["C"], "next colouring", () => change({ color: next(possible.color, look.color) })],
-  [["X"], "all points, wrong ones, uncertain ones", () => change({ only: next(possible.only, look.only) })],
+  [["X"], "all, wrong or uncertain points", () => change({ only: next(possible.only, look.only) })],
   [["0"], "show all classes", () => change({ hidden: new Set() })],
-  [["←", "→"], "scan before, after", (key) => step(key === "→" ? 1 : -1)],
+  [["←", "→"], "previous, next scan", (key) => step(key === "→" ? 1 : -1)],
   [[" "], "play the scans", play],
   [["T"], "from above", () => stand(ABOVE)],
   [["F"], "close to the ground", () => stand(STREET)],
   [["R"], "first view", () => stand(FIRST)],
   [["W", "A", "S", "D"], "move", (key) => {
-    camera.move({ A: GLIDE, D: -GLIDE }[key] ?? 0, { W: GLIDE, S: -GLIDE }[key] ?? 0);
+    camera.move({ A: KEY_MOVE, D: -KEY_MOVE }[key] ?? 0, { W: KEY_MOVE, S: -KEY_MOVE }[key] ?? 0);
     moved();
   }],
   [["Q", "E"], "turn", (key) => {
-    camera.turn(key === "Q" ? STEP : -STEP, 0);
+    camera.turn(key === "Q" ? KEY_TURN : -KEY_TURN, 0);
     moved();
   }],
   [["↑", "↓"], "zoom in, out", (key) => {
@@ -141,15 +141,15 @@ const KEYS = [
   [["B"], "a box around the point, no box", () => editor.toggleBox()],
   [["V"], "save a picture", savePicture],
   [["I"], "table of the labels' scores", () => about.table && byId("table").showModal()],
-  [["P"], "fold the panel", () => panel.fold()],
-  [["escape"], "let go of the point and of the tape", () => {
+  [["P"], "fold or unfold the panel", () => panel.fold()],
+  [["escape"], "deselect the point, clear the measurement", () => {
     tape.clear();
     click(-100, -100);
   }],
   [["?"], "this list", () => byId("keys").showModal()],
 ].filter(([names]) => names.length && (about.scans.length > 1 || !(names.includes("→") || names.includes(" "))));
 
-/** Save what is drawn as a picture; the canvas is read in the frame in which it was drawn. */
+/** Save what is drawn as a picture. The canvas must be read in the frame in which it was drawn. */
 function savePicture() {
   if (!scan) return;
   draw();
@@ -170,7 +170,7 @@ function start() {
   panel = new Panel(change);
   tape = new Tape(redraw);
   editor = new Editor(change, () => ({ look, scan, chosen }), (changed, plane) => drawing.refresh(changed, plane));
-  new Hands(byId("canvas"), camera, { camera: moved, click });
+  new Pointers(byId("canvas"), camera, { camera: moved, click });
   listen(KEYS);
   byId("above").onclick = () => stand(ABOVE);
   byId("street").onclick = () => stand(STREET);

@@ -1,4 +1,4 @@
-// The panel: labels, colouring with its key, classes to switch on and off. Names are only inserted as text.
+// The panel: labels, colours with their key, and classes to show or hide. Names are inserted only as text.
 "use strict";
 
 const byId = (id) => document.getElementById(id);
@@ -7,7 +7,7 @@ const counted = (count) => count.toLocaleString("en");
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 const cssColor = ([r, g, b]) => `rgb(${r}, ${g}, ${b})`;
 
-/** Return an element with a class, a text and children. */
+/** Return an HTML element with a CSS class, a text, children and other properties. */
 function element(kind, { name = "", text = "", children = [], ...rest } = {}) {
   const made = document.createElement(kind);
   if (name) made.className = name;
@@ -22,13 +22,13 @@ function swatch(color) {
   return made;
 }
 
-/** Return a row: swatch, name, value. */
+/** Return a row of the panel: a swatch, a name and a value. */
 function row(kind, color, text, value) {
   const texts = [element("span", { name: "name", text, title: text }), element("span", { name: "value", text: value })];
   return element(kind, { children: color ? [swatch(color), ...texts] : texts });
 }
 
-/** Fill a group of radio buttons; arrow keys move the choice. */
+/** Fill a group with radio buttons; arrow keys move the choice. */
 function choices(group, keys, chosen, make, choose) {
   const focused = group.contains(document.activeElement);
   const buttons = keys.map((key) => {
@@ -50,7 +50,7 @@ function choices(group, keys, chosen, make, choose) {
   if (focused) buttons[keys.indexOf(chosen)]?.focus();
 }
 
-/** Fill the table of the labels' scores: a row for each class and overall figure, a column for each method. */
+/** Fill the table of the labels' scores: rows for classes and overall figures, a column for each method. */
 function fillTable({ methods, rows, totals, scans, uncertain }) {
   const doubts = uncertain === null ? "" : `, ${uncertain.toFixed(1)} % uncertain`;
   byId("table-title").textContent = `IoU in % · ${scans} scan${scans > 1 ? "s" : ""}${doubts}`;
@@ -92,7 +92,7 @@ class Panel {
     byId("fold").setAttribute("aria-expanded", String(!folded));
   }
 
-  /** Return the middle of the part of the window that the panel leaves free, in clip space. */
+  /** Return the middle of the part of the window that the panel does not cover, in clip space. */
   free() {
     const { right, top, height } = byId("panel").getBoundingClientRect();
     if (this.narrow) return [0, 1 - top / innerHeight];
@@ -114,7 +114,7 @@ class Panel {
     return drawn;
   }
 
-  /** Show the labels to choose from, each with its share of correct points in this scan. */
+  /** Show the labels that can be chosen, with the share of their correct points in this scan. */
   showLabels(look, scan) {
     const make = (key) => {
       const { title } = about.sources.find((source) => source.key === key);
@@ -161,7 +161,7 @@ class Panel {
     return element("div", { name: "rows", children: [row("div", null, "uncertain", share(doubted, scan.count))] });
   }
 
-  /** Show a row for each class in any scan; alt-click shows only that class. */
+  /** Show a row for each class of any scan; a click with alt shows only this class. */
   showClasses(look, all) {
     const list = byId("classes"), focused = document.activeElement?.dataset?.id;
     const rows = about.present.map((id) => {

@@ -1,9 +1,9 @@
-// The point that was clicked: finds it, and shows its classes and values.
+// Find the point that was clicked, and show its classes and values.
 "use strict";
 
-const CLOSE = 9;  // pixels from the pointer, within which a point can be clicked
+const CLICK_RADIUS = 9;  // the largest distance from the pointer to a point that it clicks, pixels
 
-/** Return the index of the drawn point near (x, y) in the window that is nearest to the eye, or -1. */
+/** Return the index of the drawn point that is clicked at (x, y) in the window; -1 if there is none. */
 function pointAt(x, y, scan, look, matrix, width, height) {
   const shown = shownBy(look, scan), { center, step, positions } = scan;
   let best = -1, least = Infinity;
@@ -12,8 +12,8 @@ function pointAt(x, y, scan, look, matrix, width, height) {
     const [u, v, , w] = projected(p, matrix);
     if (w <= 0) continue;
     const off = Math.hypot(((u / w + 1) / 2) * width - x, ((1 - v / w) / 2) * height - y);
-    const cost = w * (1 + off);  // prefers points in front, then points closer to the pointer
-    if (off < CLOSE && cost < least && shown(i)) [best, least] = [i, cost];
+    const cost = w * (1 + off);  // prefers near points, then points close to the pointer
+    if (off < CLICK_RADIUS && cost < least && shown(i)) [best, least] = [i, cost];
   }
   return best;
 }

@@ -1,8 +1,8 @@
-// Reads the scans that the page carries: base64 of deflated planes of bytes.
+// Read the scans that the page carries: planes of bytes, deflated and in base64.
 "use strict";
 
 const about = JSON.parse(document.getElementById("about").textContent);
-const loaded = new Map();  // index of a scan -> promise of the scan
+const loaded = new Map();  // the promise of each scan, by its index
 
 function bytesOf(text) {
   const characters = atob(text), bytes = new Uint8Array(characters.length);
@@ -15,7 +15,7 @@ async function inflated(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Return (3 n) int16 x, y, z, x, ... from the low and the high bytes of each axis' differences. */
+/** Return (3 n) int16 x, y, z, x, ..., given the low bytes and then the high bytes of the differences on each axis. */
 function positionsOf(bytes, count) {
   const positions = new Int16Array(3 * count);
   for (let axis = 0; axis < 3; axis++) {
@@ -29,13 +29,13 @@ function positionsOf(bytes, count) {
 }
 
 async function read(index) {
-  const said = about.scans[index];
+  const header = about.scans[index];
   const bytes = await inflated(bytesOf(document.getElementById(`scan-${index}`).textContent));
   const planes = {};
-  said.planes.forEach((name, place) => {
-    planes[name] = bytes.subarray((6 + place) * said.count, (7 + place) * said.count);
+  header.planes.forEach((name, place) => {
+    planes[name] = bytes.subarray((6 + place) * header.count, (7 + place) * header.count);
   });
-  return { ...said, index, planes, positions: positionsOf(bytes, said.count) };
+  return { ...header, index, planes, positions: positionsOf(bytes, header.count) };
 }
 
 /** Return a promise of a scan: {name, count, center, step, positions, planes: {intensity, truth, ...}}. */
@@ -44,7 +44,7 @@ function scanAt(index) {
   return loaded.get(index);
 }
 
-/** Return [x, y, z] of a point, in metres in the sensor's frame. */
+/** Return [x, y, z] of a point in the sensor's frame, metres. */
 function placeOf(scan, i) {
   return [0, 1, 2].map((axis) => scan.center[axis] + scan.step[axis] * scan.positions[3 * i + axis]);
 }

@@ -1,4 +1,4 @@
-// GPU shaders: points and their colours, rings on the ground, shading by depth.
+// The GPU's shaders: points and their colours, rings on the ground, shading by depth.
 "use strict";
 
 const MODES = ["class", "error", "uncertainty", "height", "intensity"];
@@ -12,12 +12,12 @@ layout(location = 3) in uint label;
 layout(location = 4) in uint truth;
 layout(location = 5) in uint uncertain;
 uniform mat4 matrix;
-uniform vec3 center, unit, low, high;  // low, high: corners of the box
+uniform vec3 center, unit, low, high;  // low, high: the corners of the box
 uniform vec2 range;
 uniform vec3 right, wrong, unscored;
 uniform float size, smallest;
 uniform int mode, only;
-uniform sampler2D classes;  // colour of each class; alpha 0 if it is hidden
+uniform sampler2D classes;  // the colour of each class; its alpha is 0 if the class is hidden
 uniform sampler2D ramp;
 flat out vec3 color;
 
@@ -38,7 +38,7 @@ void main() {
   bool inside = all(greaterThanEqual(at, low)) && all(lessThanEqual(at, high));
   bool shown = inside && own.a > 0.5 && (only == 0 || (only == 1 && missed) || (only == 2 && doubted));
   gl_Position = shown ? matrix * vec4(at, 1.0) : vec4(0.0, 0.0, 2.0, 1.0);
-  // Laser beams diverge: points far from the sensor are drawn larger, so that surfaces have no gaps.
+  // Laser beams diverge. Points far from the sensor are drawn larger, so that surfaces have no gaps.
   float metres = 0.055 + 0.002 * length(at);
   bool stressed = (mode == 1 && missed) || (mode == 2 && doubted);
   gl_PointSize = clamp(size * metres / gl_Position.w, smallest, 40.0) * (stressed ? 1.4 : 1.0);
@@ -68,7 +68,7 @@ void main() { painted = vec4(strength); }`;
 const SCREEN_SHADER = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }`;
 
-// Eye-dome lighting: points next to nearer ones are darkened, which shows edges and depth without normals.
+// Eye-dome lighting darkens points next to nearer points, which shows edges and depth without normals.
 const SCREEN_COLOR = `#version 300 es
 precision highp float;
 uniform sampler2D colors;

@@ -1,4 +1,4 @@
-"""Label a fleet of scans: a pipeline of Ray Data on a Ray cluster."""
+"""Label a fleet of scans with a pipeline of Ray Data on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -35,20 +35,22 @@ from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.sensors.measure import MEASURED
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
-os.environ.setdefault("RAY_worker_niceness", "0")  # as `predict`, and not 15
+os.environ.setdefault("RAY_worker_niceness", "0")  # the niceness of `predict`, in place of 15
 import ray
 import ray.data
 from ray.exceptions import RayError
 
-WINDOW = 256_000  # scans that are planned together
-BLOCK = 64  # scans that a worker takes at a time
-SAID = 10  # drives whose assumptions are printed
+WINDOW = 256_000  # the number of scans that are planned together
+BLOCK = 64  # the number of scans that a worker takes at a time
+REPORTED_DRIVES = 10  # the most drives whose assumptions are printed
 
-OBJECT_STORE = 500_000_000  # bytes of shared memory, if Ray starts on this machine
-CORES = 4  # of a worker without a GPU, if the machine has them
-QUEUED = 2  # blocks that a worker has at a time, so that it need not wait for the next
-RETRIES = 2  # of a block whose worker ends
-MOST_LOST = 100  # blocks of a window whose workers end again and again
+# The shared memory of a Ray that starts on this machine, bytes.
+OBJECT_STORE = 500_000_000
+WORKER_CORES = 4  # the most cores of a worker without a GPU
+# The most blocks that a worker has at a time, so that it need not wait for the next block.
+WORKER_BLOCKS = 2
+RETRIES = 2  # how often a block is tried again whose worker has ended
+MOST_LOST = 100  # the most blocks of a window that may be lost because they end their workers
 ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-\[\]]+:\d+")
 
 
@@ -57,12 +59,12 @@ class Cluster:
     """The workers of a run.
 
     Attributes:
-        address: of a Ray cluster, such as `auto` or `ray://HOST:10001`; None starts Ray on this
-            machine.
-        workers: the largest number of workers; None leaves it to Ray, which starts as many as the
+        address: the address of a Ray cluster, such as `auto` or `ray://HOST:10001`; by default, Ray
+            is started on this machine.
+        workers: the largest number of workers; by default, Ray starts as many workers as the
             cluster has room for.
-        compute: where and how the networks are computed.
-        batch: scans that go through the networks together.
+        compute: the device, and how the networks compute.
+        batch: the number of scans that go through the networks together.
     """
 
     address: str | None = None
@@ -84,10 +86,12 @@ def label_fleet(
     """Label scan files on a Ray cluster, and write a table of results.
 
     Args:
-        inputs: as `list_scans` takes them.
-        request: how the scans are labelled, and what is written.
-        out: URL or path of the output folder.
-        resume: go on with an earlier run into the same folder.
+        inputs: the scans, as `list_scans` takes them.
+        request: how the scans are labelled, and which files are written.
+        out: the URL or the path of the output folder.
+        cluster: the workers.
+        resume: continue an earlier run into the same folder.
+        progress: called with the number of scans that are done, and their total so far.
         report: takes lines about what was assumed of the sensors, and how sure the labels are.
 
     Returns:
@@ -95,8 +99,8 @@ def label_fleet(
 
     Raises:
         InputError: before anything is computed, if an input or the output folder cannot be used, or
-            the earlier run had another request; while scans are listed, if two have one name; if
-            the workers cannot run; at the end, if all scans are broken.
+            the earlier run had another request; while scans are listed, if two have the same name;
+            at any time, if the workers cannot run; at the end, if all scans are broken.
         SomeBroken: at the end, if some scans are broken.
         OSError: if labels cannot be written.
     """
@@ -120,7 +124,7 @@ def label_fleet(
 
 
 def _windows(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:
-    """Join tables until they have as many scans as are planned together."""
+    """Yield joined tables of at least `WINDOW` scans; the last one may have fewer scans."""
     waiting: list[pa.Table] = []
     for table in tables:
         waiting.append(table)
@@ -136,9 +140,11 @@ class FleetRun:
 
     Args:
         request: how the scans are labelled.
-        results: takes the rows; has what an earlier run has done.
+        results: the table of results; it knows the scans that an earlier run has done.
         cluster: the workers.
-        resources: that each worker needs, as options of Ray.
+        resources: the resources of each worker, as options of Ray.
+        progress: called with the number of scans that are done, and their total so far.
+        report: takes lines for the user.
     """
 
     def __init__(
@@ -156,13 +162,13 @@ class FleetRun:
         self.resources = resources
         self._progress = progress
         self._report = report
-        self._paths = NameSet()  # that are written
-        self._names = NameSet()
+        self._paths = NameSet()  # the files that are written
+        self._names = NameSet()  # the scans
         self._planned = 0
         self._taken = 0
 
     def plan(self, window: pa.Table) -> pa.Table:
-        """Return the scans that are not done; raise InputError if two write the same file."""
+        """Return the scans that are not done; raise InputError if two would write the same file."""
         names = window["name"].to_pylist()
         for ending in self.request.endings:
             is_new = self._paths.add([f"{name}{ending}" for name in names])
@@ -178,7 +184,7 @@ class FleetRun:
 
     def measure(self, window: pa.Table) -> None:
         """Measure the drives that are new in a window, and write their table."""
-        first: dict[str, list[int]] = {}  # scans of each drive
+        first: dict[str, list[int]] = {}  # the first scans of each drive
         for index, drive in enumerate(window["drive"].to_pylist()):
             if drive not in self.results.estimates:
                 scans = first.setdefault(drive, [])
@@ -199,11 +205,12 @@ class FleetRun:
         self._say_assumed(sorted(rows.values(), key=itemgetter("drive")))
 
     def _say_assumed(self, rows: Sequence[dict[str, Any]]) -> None:
-        for row in rows[:SAID]:
+        for row in rows[:REPORTED_DRIVES]:
             self._report(row["assumed"] or f"{row['drive']}: expected scans to measure, found none")
-        if len(rows) > SAID:
+        more = len(rows) - REPORTED_DRIVES
+        if more > 0:
             place = self.results.folder / DRIVES
-            self._report(f"what is assumed of {len(rows) - SAID} more drives is in {place.url}")
+            self._report(f"what is assumed of {more} more drives is in {place.url}")
 
     def label(self, scans: pa.Table) -> None:
         """Label scans of drives that are measured.
@@ -213,13 +220,13 @@ class FleetRun:
             OSError: if labels cannot be written.
         """
         lost = self._label_in_blocks(_with_estimates(scans, self.results.estimates), BLOCK)
-        # A scan among these ends its workers. One scan at a time shows which one.
+        # Some of these scans end their workers. Blocks of one scan show which ones.
         lost = self._label_in_blocks(lost, 1)
         if len(lost):
             self._take(self._rows_of_lost(lost))
 
     def _label_in_blocks(self, scans: pa.Table, size: int) -> pa.Table:
-        """Label scans in blocks of a size; return those whose workers have ended."""
+        """Label scans in blocks of a size; return the scans whose workers have ended."""
         blocks = [scans.slice(start, size) for start in range(0, len(scans), size)]
         if not blocks:
             return scans
@@ -235,7 +242,7 @@ class FleetRun:
         return scans.filter(pa.array([name not in done for name in scans["name"].to_pylist()]))
 
     def _take(self, rows: pa.Table) -> None:
-        """Add rows to the results; raise OSError if one says that labels cannot be written."""
+        """Add rows to the results; raise OSError if a row says that labels cannot be written."""
         is_fatal = rows[IS_FATAL.name]
         self.results.add(rows.filter(pc.invert(is_fatal)).drop_columns([IS_FATAL.name]))
         for line in rows["error"].filter(is_fatal).to_pylist():
@@ -263,12 +270,18 @@ class FleetRun:
         resources: dict[str, Any],
         most_lost: int = -1,
     ) -> Generator[pa.Table]:
-        """Yield what workers make of blocks, except of those whose workers end again and again.
+        """Let workers process blocks.
 
         Args:
             kind: the class of the workers; a worker takes one block at a time.
-            arguments: of the class.
-            most_lost: blocks that may be lost; -1 stands for any number.
+            arguments: the arguments of the class.
+            blocks: the tables.
+            resources: the resources of each worker, as options of Ray.
+            most_lost: the most blocks that may be lost; -1 stands for any number.
+
+        Yields:
+            The table that a worker returns for each block. A block is lost if every worker that
+            takes it ends.
 
         Raises:
             InputError: if the workers cannot be started, or more blocks are lost.
@@ -276,8 +289,9 @@ class FleetRun:
         context = ray.data.DataContext.get_current()
         context.enable_progress_bars = False
         context.max_errored_blocks = most_lost
-        # A scan that waits for a worker is lost with it; those that are tried alone never wait.
-        queued = QUEUED if max(map(len, blocks)) > 1 else 1
+        # If a worker ends, the blocks that wait for it are lost as well. Blocks of one scan
+        # therefore never wait.
+        queued = WORKER_BLOCKS if max(map(len, blocks)) > 1 else 1
         workers = self.cluster.workers
         dataset = ray.data.from_arrow(list(blocks)).map_batches(
             Worker,
@@ -298,11 +312,11 @@ class FleetRun:
             raise InputError(_reason(error)) from error
 
     def finish(self) -> int:
-        """Say how sure the labels are; return the number of label files that exist.
+        """Report how sure the labels are; return the number of label files that exist.
 
         Raises:
             InputError: if all scans are broken.
-            SomeBroken: if some are.
+            SomeBroken: if some scans are broken.
         """
         faults: list[str] = []
         written = 0
@@ -334,7 +348,7 @@ class Worker:
 
     Args:
         kind: the class that does the work.
-        arguments: refers to its arguments, which Ray copies to each machine once.
+        arguments: a reference to the arguments of the class, which Ray copies to each machine once.
     """
 
     def __init__(self, kind: type[LabelScans] | type[MeasureSensors], arguments: Any) -> None:
@@ -345,7 +359,7 @@ class Worker:
 
 
 def _with_estimates(scans: pa.Table, estimates: dict[str, str]) -> pa.Table:
-    """Return scans as `LabelScans` takes them, those of each drive one after the other."""
+    """Return scans with the column `estimates`, grouped by drive, as `LabelScans` takes them."""
     order: dict[str, list[int]] = {}
     for index, drive in enumerate(scans["drive"].to_pylist()):
         order.setdefault(drive, []).append(index)
@@ -358,10 +372,10 @@ def _with_estimates(scans: pa.Table, estimates: dict[str, str]) -> pa.Table:
 
 
 def connect(address: str | None = None) -> None:
-    """Connect this process to a Ray cluster, unless it is already.
+    """Connect this process to a Ray cluster, unless it is already connected.
 
     Args:
-        address: as in `Cluster`.
+        address: the address, as in `Cluster`.
 
     Raises:
         InputError: if the text is no address, or there is no cluster at it.
@@ -403,7 +417,7 @@ def _own_signals() -> Iterator[None]:
 
 
 def share_cluster(cluster: Cluster) -> dict[str, Any]:
-    """Return what each worker needs, as options of Ray: a GPU, or else some cores.
+    """Return the resources of each worker, as options of Ray: a GPU or, without GPUs, some cores.
 
     Raises:
         InputError: if the device is a GPU, and the cluster has none.
@@ -417,12 +431,13 @@ def share_cluster(cluster: Cluster) -> dict[str, Any]:
     if gpus and device != "cpu":
         return {"num_gpus": 1, "num_cpus": 1}
     of_nodes = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
-    smallest = min(filter(None, of_nodes), default=CORES)  # some clusters start without workers
-    return {"num_cpus": max(min(CORES, smallest, cores // (cluster.workers or 1)), 1)}
+    # Some clusters start without any node for workers.
+    smallest = min(filter(None, of_nodes), default=WORKER_CORES)
+    return {"num_cpus": max(min(WORKER_CORES, smallest, cores // (cluster.workers or 1)), 1)}
 
 
 def _precision(request: LabellingRequest, cluster: Cluster, resources: dict[str, Any]) -> Any:
-    """Return the precision of all workers: "auto" is what it stands for on the first one."""
+    """Return the precision of all workers; "auto" becomes the choice of a machine with a GPU."""
     if request.precision != "auto" or "num_gpus" not in resources:
         return choose_precision(request.precision, "cpu")
     device = cluster.compute.device

@@ -20,9 +20,9 @@ import pytest
 ray = pytest.importorskip("ray")
 
 from amvnet.errors import InputError, SomeBroken  # noqa: E402
-from amvnet.fleet import on_ray  # noqa: E402
+from amvnet.fleet import pipeline  # noqa: E402
 from amvnet.fleet.labelling import IS_FATAL  # noqa: E402
-from amvnet.fleet.on_ray import Cluster, FleetRun, connect  # noqa: E402
+from amvnet.fleet.pipeline import Cluster, FleetRun, connect  # noqa: E402
 from amvnet.fleet.results import DRIVES_SCHEMA, Results, results_schema  # noqa: E402
 from amvnet.fleet.storage import Place  # noqa: E402
 from amvnet.inference.request import LabellingRequest  # noqa: E402
@@ -37,9 +37,9 @@ pytestmark = pytest.mark.slow
 CLI = """
 import sys
 from amvnet.cli.main import main
-from amvnet.fleet import on_ray, results
+from amvnet.fleet import pipeline, results
 
-on_ray.BLOCK = 2
+pipeline.BLOCK = 2
 results.PART_SECONDS = 0.0  # every block at once
 sys.exit(main())
 """
@@ -318,7 +318,7 @@ def test_two_scans_that_write_one_file_are_refused(fleet: Path, tmp_path: Path) 
 
 def test_scans_of_one_drive_follow_one_another_with_its_estimates() -> None:
     scans = pa.concat_tables([scans_of("a", "1", "2"), scans_of("b", "3"), scans_of("a", "4")])
-    rows = on_ray._with_estimates(scans, {"a": "A", "b": "B"}).to_pylist()
+    rows = pipeline._with_estimates(scans, {"a": "A", "b": "B"}).to_pylist()
     assert [row["name"] + row["estimates"] for row in rows] == ["1A", "2A", "4A", "3B"]
 
 
@@ -361,11 +361,11 @@ class Measuring:
 def mortal(ray_here: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Workers that can be killed, with blocks of two scans."""
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    monkeypatch.setattr(on_ray, "LabelScans", Mortal)
-    monkeypatch.setattr(on_ray, "MeasureSensors", Measuring)
-    monkeypatch.setattr(on_ray, "BLOCK", 2)
-    monkeypatch.setattr(on_ray, "MEASURED", 1)
-    monkeypatch.setattr(on_ray, "RETRIES", 1)
+    monkeypatch.setattr(pipeline, "LabelScans", Mortal)
+    monkeypatch.setattr(pipeline, "MeasureSensors", Measuring)
+    monkeypatch.setattr(pipeline, "BLOCK", 2)
+    monkeypatch.setattr(pipeline, "MEASURED", 1)
+    monkeypatch.setattr(pipeline, "RETRIES", 1)
 
 
 def label(run: FleetRun, scans: pa.Table) -> None:
@@ -399,7 +399,7 @@ def test_a_scan_that_ends_its_workers_is_a_broken_one(
 def test_workers_that_end_again_and_again_are_one_line(
     mortal: None, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(on_ray, "MOST_LOST", 0)
+    monkeypatch.setattr(pipeline, "MOST_LOST", 0)
     fails(lambda: label(run_in(fleet, tmp_path), scans_of("a", "poison", "1")), "expected workers")
 
 
@@ -424,7 +424,7 @@ class Reluctant(Mortal):
 def test_workers_that_cannot_start_are_one_line(
     mortal: None, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(on_ray, "LabelScans", Reluctant)
+    monkeypatch.setattr(pipeline, "LabelScans", Reluctant)
     run = run_in(fleet, tmp_path)
     fails(lambda: label(run, scans_of("a", "1")), "expected a library", "install it")
 
@@ -435,11 +435,11 @@ def test_workers_that_cannot_start_are_one_line(
 def test_windows_hold_as_many_scans_as_are_planned_together(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(on_ray, "WINDOW", 3)
+    monkeypatch.setattr(pipeline, "WINDOW", 3)
 
     def sizes(lengths: Sequence[int]) -> list[int]:
         tables = [scans_of("a", *map(str, range(length))) for length in lengths]
-        return [len(window) for window in on_ray._windows(iter(tables))]
+        return [len(window) for window in pipeline._windows(iter(tables))]
 
     assert sizes([1, 1, 1, 2, 2, 1]) == [3, 4, 1]
     assert sizes([3]) == [3]

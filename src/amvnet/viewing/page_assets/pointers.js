@@ -1,14 +1,17 @@
-// Mouse, touch and keys.
+// Turn mouse, touch and keys into movements of the camera, clicks and calls.
 "use strict";
 
-const STILL = 5;  // pixels that a pointer may move during a click
-const TWICE = 400;  // milliseconds, at most, between the clicks of a double click
+const CLICK_TRAVEL = 5;  // the farthest that a pointer may move during a click, pixels
+const DOUBLE_CLICK = 400;  // the longest time between the clicks of a double click, milliseconds
 
-/** Turn, move and zoom with pointers; calls `on.camera()` after a change and `on.click(x, y, again)`. */
-class Hands {
+/**
+ * Turns, moves and zooms the camera with pointers. It calls `on.camera()` after a change, and
+ * `on.click(x, y, isDouble)` after a click.
+ */
+class Pointers {
   constructor(canvas, camera, on) {
     Object.assign(this, { canvas, camera, on });
-    this.down = new Map();  // pointer id -> its last position
+    this.down = new Map();  // the last position of each pressed pointer, by its id
     this.last = { time: 0, x: 0, y: 0 };
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
@@ -32,12 +35,12 @@ class Hands {
     this.travelled += Math.hypot(dx, dy);
     if (this.down.size > 1) this.pinch(event.pointerId, before, now);
     else if (event.shiftKey || event.buttons & 6) this.camera.move(dx / this.height, dy / this.height);
-    else if (this.travelled > STILL) this.camera.turn(dx / this.height, dy / this.height);
+    else if (this.travelled > CLICK_TRAVEL) this.camera.turn(dx / this.height, dy / this.height);
     this.down.set(event.pointerId, now);
     this.on.camera();
   }
 
-  /** Move the scene with the middle of two fingers, and zoom with their distance. */
+  /** Move the scene with the middle of two fingers, and zoom with the distance between them. */
   pinch(pointer, before, now) {
     const [other] = [...this.down].filter(([id]) => id !== pointer).map(([, place]) => place);
     const apart = (place) => Math.max(Math.hypot(place.x - other.x, place.y - other.y), 1);
@@ -48,11 +51,11 @@ class Hands {
   release(event) {
     if (!this.down.delete(event.pointerId)) return;
     if (!this.down.size) this.canvas.classList.remove("moving");
-    if (event.type === "pointercancel" || this.travelled > STILL || event.button) return;
+    if (event.type === "pointercancel" || this.travelled > CLICK_TRAVEL || event.button) return;
     const { clientX: x, clientY: y, timeStamp: time } = event;
-    const again = time - this.last.time < TWICE && Math.hypot(x - this.last.x, y - this.last.y) < 20;
-    this.last = { time: again ? 0 : time, x, y };
-    this.on.click(x, y, again);
+    const isDouble = time - this.last.time < DOUBLE_CLICK && Math.hypot(x - this.last.x, y - this.last.y) < 20;
+    this.last = { time: isDouble ? 0 : time, x, y };
+    this.on.click(x, y, isDouble);
   }
 
   wheel(event) {
@@ -67,7 +70,7 @@ class Hands {
     return this.canvas.clientHeight;
   }
 
-  /** Return a window position relative to the camera's target: right and up, in fractions of the height. */
+  /** Return a position in the window relative to the camera's target, right and up, in fractions of the height. */
   fromTarget(x, y) {
     const [right, up] = this.camera.middle, width = this.canvas.clientWidth;
     return [(x - (width * (1 + right)) / 2) / this.height, ((this.height * (1 - up)) / 2 - y) / this.height];
