@@ -11,8 +11,8 @@ ENV PATH=/opt/amvnet/bin:$PATH
 WORKDIR /build
 COPY constraints.txt docker/requirements.txt ./
 
-# torch first and by itself, as in the Makefile. PyPI's wheels bring CUDA with them; builds for the
-# CPU have an index of their own, where the same version is newer by its suffix (+cpu).
+# Install torch first and alone, as the Makefile does. PyPI's wheels bring CUDA. Builds for the CPU are
+# in another index; pip prefers them, because the suffix +cpu makes the same version newer.
 RUN case "$DEVICE" in \
       cpu) export PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu ;; \
       cuda) ;; \
@@ -21,7 +21,7 @@ RUN case "$DEVICE" in \
     && pip install --no-cache-dir --constraint constraints.txt --constraint requirements.txt torch
 RUN pip install --no-cache-dir --constraint constraints.txt --requirement requirements.txt
 
-# The package itself last: a change of its code repeats only this.
+# Install the package last, so that a change of its code repeats only this step.
 COPY LICENSE README.md pyproject.toml ./
 COPY src src
 RUN pip install --no-cache-dir --no-deps --no-build-isolation . && pip check
@@ -34,7 +34,8 @@ RUN useradd --uid 1000 --create-home --no-log-init amvnet \
     && install --directory --owner amvnet --group amvnet /data
 COPY --from=build /opt/amvnet /opt/amvnet
 
-# Caches lie where any user can write. The last two let NVIDIA's container runtime hand over a GPU.
+# The caches lie where any user can write. The last two variables let NVIDIA's container runtime pass a
+# GPU to the container.
 ENV PATH=/opt/amvnet/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     MPLCONFIGDIR=/tmp/matplotlib \

@@ -1,6 +1,8 @@
-"""Print the versions for docker/requirements.txt, by pip, for the Python that runs this.
+"""Print the versions that pip would install, for docker/requirements.txt.
 
-python3.12 docker/lock.py > docker/requirements.txt
+Run this with the Python of the image:
+
+    python3.12 docker/lock.py > docker/requirements.txt
 """
 
 from __future__ import annotations
@@ -11,13 +13,13 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-# All but the tests, the loggers of other services, and the fleet.
+# The extras that the image has.
 EXTRAS = ("simulate", "formats", "export", "hub")
 
-# Left out: torch, which constraints.txt pins, and the packages that torch itself pins, not all of
-# which exist for every machine.
+# The beginnings of the names that are left out: torch, which constraints.txt pins, and the packages
+# that torch itself pins. Some of these packages do not exist for every machine.
 OF_TORCH = ("cuda-", "nvidia-", "torch", "triton")
-KEPT = ("torchmetrics",)
+KEPT = ("torchmetrics",)  # the packages that are kept in spite of their names
 HEADER = f"""\
 # What the image installs besides torch, for Python 3.12: the package with {", ".join(EXTRAS)}.
 # Written by: python3.12 docker/lock.py > docker/requirements.txt"""

@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# Train the built-in weights, from streets to OUT/head/weights.safetensors; started again, it goes on.
+# Train the built-in weights, from streets to OUT/head/weights.safetensors. Start it again to continue.
 #
 #     runs/built_in_weights.sh hdl64e|hdl32e OUT [INIT] [--KEY VALUE ...]
 #
-# INIT are weights to begin with, such as sim-hdl64e; options of `amvnet train` may follow. An epoch is
-# 6,000 scans of 1,000 streets, which are other streets in each epoch. A network takes 0.5 to 1 s a scan on a CPU core, and 4 minutes
-# an epoch on an H100. docs/log.md says how the training of the shipped weights differed.
+# INIT are weights to begin with, such as sim-hdl64e; options of `amvnet train` may follow. An epoch has
+# 6,000 scans of 1,000 streets, and each epoch has other streets. A network takes 0.5 to 1 s for a scan on
+# a CPU core, and 4 minutes for an epoch on an H100. docs/log.md says how the training of the shipped
+# weights differed.
 set -euo pipefail
 sensor=$1 out=$2
 shift 2
@@ -28,7 +29,7 @@ case $sensor in
 esac
 train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --resume)
 
-# Both networks at the same time, one on each core of a small machine.
+# Train both networks at the same time, one on each core of a small machine.
 networks=(--train-sequences "$(seq -s, 0 999)" --training.rv.region_loss lovasz)
 for stage in rv bev; do
     networks+=("--training.$stage.epochs" 10 "--training.$stage.batch" 8 "--training.$stage.lr" 0.002)
@@ -47,12 +48,13 @@ done
 wait %1
 wait %2
 
-# Class weights make the networks name rare classes too often on real streets, and RV is too sure of itself.
+# Calibrate both networks: class weights make them name rare classes too often on real streets, and RV is
+# too sure of itself.
 calibrated=$out/calibrated.safetensors
 python -m amvnet.weights.calibrate "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$calibrated" "${calibration[@]}"
 
-# The head learns on streets that the networks have not seen, under stronger changes of the sensor and from
-# disturbed scores: on streets like their own the networks are too sure, and the head would rely on them.
+# Train the head on streets that the networks have not seen, with stronger changes of the sensor and with
+# disturbed scores. On streets like their own, the networks are too sure, and the head would rely on them.
 "${train[@]}" --out "$out/head" --init "$calibrated" --stage head \
     --train-sequences "$(seq -s, 800000 800154)" --training.head.views 1 --training.head.points 600000 \
     --training.head.epochs 10 --training.head.disturb 0.3 \

@@ -1,4 +1,4 @@
-"""What the node reports about itself once a second: how many clouds, how fast, how certain."""
+"""Report once a second how many clouds the node labels, how fast and how surely."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from threading import Lock
 
 
 class Level(Enum):
-    """Levels of a DiagnosticStatus, by name."""
+    """The levels of a DiagnosticStatus; a value is the name of a level in ROS."""
 
     OK = "OK"
     WARN = "WARN"
@@ -18,7 +18,7 @@ class Level(Enum):
 
 @dataclass(frozen=True)
 class Report:
-    """A DiagnosticStatus: level, message, and values by name."""
+    """The content of a DiagnosticStatus: a level, a message, and values by name."""
 
     level: Level
     message: str
@@ -30,10 +30,11 @@ class Labelled:
     """A cloud that was labelled.
 
     Attributes:
-        seconds: from its arrival to its labels.
-        age: seconds from its stamp to its labels.
-        points: number of its points.
-        uncertain: share of points on which the networks disagree; None for a single network.
+        seconds: the seconds from the arrival of the cloud to its labels.
+        age: the seconds from the stamp of the cloud to its labels.
+        points: the number of points.
+        uncertain: the share of points on which the networks disagree, in [0, 1]; None for a single
+            network.
     """
 
     seconds: float
@@ -72,7 +73,7 @@ class Health:
         """Count a cloud that arrived.
 
         Args:
-            drops: whether an older one is dropped for it.
+            drops: whether an older cloud is dropped for it.
         """
         with self._lock:
             self._period.received += 1
@@ -95,7 +96,7 @@ class Health:
         """Return what happened since the last report, and begin a new period.
 
         Args:
-            seconds: since the last report.
+            seconds: the time since the last report.
         """
         with self._lock:
             period = self._period
@@ -110,7 +111,7 @@ class Health:
 
 
 def _describe(period: _Period, seconds: float) -> dict[str, str]:
-    """Return the values of a period; they are medians over its clouds, or maxima if so named."""
+    """Return the values of a period: medians over its clouds, or maxima if their names say so."""
     labelled = period.labelled
     rate = len(labelled) / seconds if seconds > 0 else 0.0
     values = {"clouds labelled per second": f"{rate:.2f}"}
@@ -130,7 +131,7 @@ def _describe(period: _Period, seconds: float) -> dict[str, str]:
 
 
 def _judge(period: _Period, usual_uncertain: float) -> tuple[Level, str]:
-    """Return level and message of the report on a period."""
+    """Return the level and the message of the report on a period."""
     if period.refusal:
         return Level.ERROR, period.refusal
     if not period.received and not period.labelled:
@@ -148,5 +149,6 @@ def _judge(period: _Period, usual_uncertain: float) -> tuple[Level, str]:
 
 
 def _uncertain(period: _Period) -> float | None:
+    """Return the median share of uncertain points; None if it is not known."""
     shares = [cloud.uncertain for cloud in period.labelled if cloud.uncertain is not None]
     return median(shares) if shares else None

@@ -1,4 +1,4 @@
-"""Labels as ROS messages of the type sensor_msgs/PointCloud2, in the classes of any ROS library."""
+"""Encode labels as sensor_msgs/PointCloud2, with the message classes of any ROS library."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, TYPES
 FIELD_TYPE = "sensor_msgs/msg/PointField"
 HEADER_TYPE = "std_msgs/msg/Header"
 TIME_TYPE = "builtin_interfaces/msg/Time"
-NANOSECONDS = 1_000_000_000  # of a second
-ALIGNMENT = 4  # bytes: every field of an encoded point starts at a multiple, as in PCL
+NANOSECONDS = 1_000_000_000  # the nanoseconds of a second
+ALIGNMENT = 4  # the step between the fields of an encoded point, as in PCL, bytes
 
 
 @dataclass(frozen=True)
 class Message:
-    """What the labels of a cloud take over from its message.
+    """The parts of a cloud's message that its labels keep.
 
     Attributes:
-        stamp: when the points were measured, nanoseconds since the epoch.
-        frame_id: name of the frame of the coordinates.
-        height: number of rows of an organised cloud, else 1.
+        stamp: the time at which the points were measured, nanoseconds since the epoch.
+        frame_id: the name of the frame of the coordinates.
+        height: the number of rows of an organised cloud, else 1.
     """
 
     stamp: int
@@ -35,7 +35,7 @@ class Message:
 
     @classmethod
     def of(cls, message: Any) -> Message:
-        """Return what the header of a deserialised PointCloud2 says."""
+        """Return these parts of a deserialised PointCloud2."""
         stamp = message.header.stamp
         nanoseconds = stamp.sec * NANOSECONDS + stamp.nanosec
         return cls(nanoseconds, message.header.frame_id, message.height)
@@ -49,7 +49,7 @@ class LabelledPoints:
         xyz: (N, 3) coordinates, metres.
         raw: (N,) uint32 raw ids.
         colors: (N, 3) uint8 RGB.
-        uncertain: (N,) bool, or None if unknown.
+        uncertain: (N,) bool; None if it is not known which points are uncertain.
     """
 
     xyz: np.ndarray
@@ -73,16 +73,17 @@ def encode_labels(
 ) -> Any:
     """Return the message of N labelled points, in their order.
 
-    Its fields are x, y, z (float32), rgb (float32, packed as in PCL), label (uint32, raw ids) and
-    uncertain (uint8), if it is known. PCL and RViz read no other type of coordinates.
+    Its fields are x, y, z (float32), rgb (float32, packed as in PCL), label (uint32, raw ids) and,
+    if it is known, uncertain (uint8). Coordinates are float32 because PCL and RViz read no other
+    type.
 
     Args:
         types: the classes of PointCloud2, PointField, Header and Time by name, such as `types` of a
             type store of rosbags.
-        origin: gives the header and the rows.
+        origin: the parts of the cloud's message, for the header and the rows.
         points: the points and their labels; NaN stays NaN.
         has_points: whether the message has x, y, z and rgb.
-        to_bytes: turns (B,) uint8 into the type of the library for bytes.
+        to_bytes: turns (B,) uint8 into the library's type for bytes.
     """
     columns: dict[str, np.ndarray] = {}
     if has_points:

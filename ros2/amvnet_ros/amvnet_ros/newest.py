@@ -1,4 +1,4 @@
-"""Work on the newest item only, in a thread of its own."""
+"""Work only on the newest item, in a separate thread."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 class NewestOnly(Generic[T]):
-    """Works on one item at a time, and then on the newest one: nothing queues.
+    """Works on one item at a time, and then on the newest item; there is no queue.
 
     Args:
         work: called with each item, in the thread.
@@ -20,7 +20,7 @@ class NewestOnly(Generic[T]):
     def __init__(self, work: Callable[[T], None], fail: Callable[[Exception], None]) -> None:
         self._work = work
         self._fail = fail
-        self._waiting: list[T] = []  # at most one
+        self._waiting: list[T] = []  # at most one item
         self._is_open = True
         self._changed = Condition()
         self._thread = Thread(target=self._run, name="newest-only", daemon=True)
@@ -35,7 +35,7 @@ class NewestOnly(Generic[T]):
         return drops
 
     def close(self) -> None:
-        """End the thread after the item that it works on; an item that waits is dropped."""
+        """End the thread after its present item; an item that waits is dropped."""
         with self._changed:
             self._is_open = False
             self._changed.notify()

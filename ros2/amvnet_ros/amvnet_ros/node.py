@@ -1,4 +1,4 @@
-"""The node: subscribes to scans, publishes labels, a coloured cloud and diagnostics."""
+"""The node: it subscribes to scans, and publishes labels, a coloured cloud and diagnostics."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ from amvnet_ros.messages import (
 from amvnet_ros.newest import NewestOnly
 from amvnet_ros.segmentation import CloudSegmenter, LabelledCloud, Settings
 
-# Exit codes, as those of the command line.
+# The exit codes, the same as in the command line.
 DONE = 0
 FAILED = 1
 WRONG_INPUT = 2
 
 TYPES = {CLOUD_TYPE: PointCloud2, FIELD_TYPE: PointField, HEADER_TYPE: Header, TIME_TYPE: Time}
-REPORT_PERIOD = 1.0  # seconds
-REFUSAL_PERIOD = 5.0  # seconds between lines of the log about broken clouds
+REPORT_PERIOD = 1.0  # the time between two reports, seconds
+REFUSAL_PERIOD = 5.0  # the least time between two lines of the log about broken clouds, seconds
 
 
 @dataclass(frozen=True)
 class _Arrival:
-    """A message, and when it arrived (seconds of `time.monotonic`)."""
+    """A message, and the time of its arrival by `time.monotonic`, in seconds."""
 
     message: Any
     time: float
 
 
 class SegmentNode(Node):
-    """Labels the newest scan whenever the one before is done.
+    """Labels the newest scan whenever the previous scan is done.
 
     Raises:
         InputError: if a parameter is wrong.
@@ -121,7 +121,7 @@ class SegmentNode(Node):
             self.get_logger().error(str(error), throttle_duration_sec=REFUSAL_PERIOD)
             return
 
-        # Encoding takes time, so that only messages with a subscriber are encoded.
+        # Encoding takes time, so only messages with a subscriber are encoded.
         if self._labels.get_subscription_count():
             self._labels.publish(to_ros(labelled, has_points=False))
         if self._cloud.get_subscription_count():
@@ -138,7 +138,7 @@ class SegmentNode(Node):
         )
 
     def _fail(self, error: Exception) -> None:
-        """End the node: an error that is not due to the message would come again."""
+        """End the node: the error is not due to the message, so that it would come again."""
         if not self.context.ok():  # the node was stopped while it labelled
             return
         self.exit_code = FAILED
@@ -165,9 +165,9 @@ class SegmentNode(Node):
 
 
 def newest_cloud_profile() -> QoSProfile:
-    """Return the profile for sensor data, but with only the newest cloud.
+    """Return the profile for sensor data that keeps only the newest cloud.
 
-    Each topic needs its own: rclpy writes what the user overrides for a topic into its profile.
+    Each topic needs its own profile: rclpy writes the user's overrides for a topic into it.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
@@ -178,7 +178,7 @@ def newest_cloud_profile() -> QoSProfile:
 
 
 def latched_profile() -> QoSProfile:
-    """Return a profile with which late subscribers get the last message, too."""
+    """Return a profile with which late subscribers also get the last message."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=1,
@@ -188,7 +188,7 @@ def latched_profile() -> QoSProfile:
 
 
 def to_ros(labelled: LabelledCloud, has_points: bool) -> PointCloud2:
-    """Return the message with label and uncertain, and with x, y, z, rgb if it has points."""
+    """Return the message of labelled points; it has x, y, z and rgb only if `has_points`."""
     return encode_labels(
         TYPES,
         labelled.origin,
@@ -201,7 +201,8 @@ def to_ros(labelled: LabelledCloud, has_points: bool) -> PointCloud2:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until it is stopped; return the exit code.
 
-    0 after the shutdown, 2 if a parameter is wrong (one line on stderr), 1 after any other error.
+    The exit code is 0 after the shutdown, 2 if a parameter is wrong (with one line on stderr), and
+    1 after any other error.
     """
     wait_passively()
 

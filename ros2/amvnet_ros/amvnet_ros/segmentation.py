@@ -1,4 +1,4 @@
-"""From a PointCloud2 to the labels of its points, without ROS."""
+"""Label the points of a PointCloud2; this needs no ROS."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def _parameter(default: Any, description: str) -> Any:
 
 @dataclass(frozen=True)
 class Settings:
-    """The parameters of the node, with the meaning of the options of `amvnet predict`.
+    """The parameters of the node, which mean the same as the options of `amvnet predict`.
 
-    ROS has no None: a parameter is empty, 0 or negative if its value is to be measured.
+    ROS has no None. A parameter is empty, 0 or negative if its value is to be measured.
     """
 
     weights: str = _parameter("sim-hdl64e", "a name, a path, or hf-hub:OWNER/NAME")
@@ -30,7 +30,7 @@ class Settings:
     device: str = _parameter("auto", "cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU")
     engine: str = _parameter("torch", "torch, onnx or int8")
     precision: str = _parameter("auto", "float32, bfloat16, on a GPU float16, or auto")
-    threads: int = _parameter(0, "of the processor; 0: as many as it has cores")
+    threads: int = _parameter(0, "threads of the processor; 0: as many as it has cores")
     sensor: str = _parameter("", "a name such as os1-64, or a YAML file; empty: measured")
     height: float = _parameter(-1.0, "metres over the ground; negative: measured")
     intensity_scale: float = _parameter(0.0, "the largest possible intensity; 0: measured")
@@ -57,9 +57,10 @@ class LabelledCloud:
     """The points of a message with their labels, in their order.
 
     Attributes:
-        origin: what the labels take over from the message.
-        points: with raw ids, 0 for lost points, and the colours of the classes.
-        uncertain_share: share of uncertain points, without lost points; None for a single network.
+        origin: the parts of the message that its labels keep.
+        points: the points with raw ids, 0 for lost points, and class colours.
+        uncertain_share: the share of uncertain points among all points that are not lost, in
+            [0, 1]; None for a single network.
     """
 
     origin: Message
@@ -75,13 +76,13 @@ class CloudSegmenter:
 
     Attributes:
         taxonomy: the classes.
-        hardware: what computes, in words.
+        hardware: the device that computes, in words.
         usual_uncertain: the share of uncertain points in the scans that the weights were validated
             on, in [0, 1].
 
     Args:
         settings: the parameters of the node.
-        topic: where the messages come from, for messages to people.
+        topic: the topic of the messages, for lines of the log.
         report: called once with what was assumed about the sensor.
 
     Raises:
@@ -122,7 +123,7 @@ class CloudSegmenter:
         """Label the points of a message.
 
         Raises:
-            InputError: if the message is broken, or none of its points is usable.
+            InputError: if the message is broken, or no point is usable.
         """
         with reading(self._topic, "a PointCloud2 message", "check the driver"):
             cloud = read_message(message, self._topic)
@@ -140,7 +141,7 @@ class CloudSegmenter:
         return LabelledCloud(origin, points, None if verdict is None else verdict.share)
 
     def classes(self) -> str:
-        """Return the classes as JSON: id as in the field label, name, color (RGB)."""
+        """Return the classes as JSON: id (as in the field label), name and color (RGB) of each."""
         taxonomy = self.taxonomy
         rows = zip(taxonomy.train_to_raw, taxonomy.names, taxonomy.colors, strict=True)
         entries = []
