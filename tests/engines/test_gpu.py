@@ -513,7 +513,8 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
         "uncertain": False,
         "format": "label",
     }
-    Journal(tmp_path, settings)
+    with Journal(tmp_path, settings):
+        pass
 
     for option, value in (("precision", "bfloat16"), ("tau", 0.1)):
         code, error = run_cli(*arguments, "--resume", f"--{option}", value)

@@ -394,14 +394,13 @@ def test_the_folder_of_another_run_is_named_in_a_warning(
 )
 def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, text: str, done: int) -> None:
     """A scan whose line was not written to the end is not done."""
-    journal = Journal(tmp_path, {"x": 1})
-    with journal.path.open("a") as file:
+    with Journal(tmp_path, {"x": 1}) as journal, journal.path.open("a") as file:
         file.write(text)
 
     read = read_journals(tmp_path, {"x": 1})
     assert list(read.values()) == ENTRIES[:done]
-    del journal
-    lines = Journal(tmp_path, {"x": 1}, read.values()).path.read_text().splitlines()
+    with Journal(tmp_path, {"x": 1}, read.values()) as journal:
+        lines = journal.path.read_text().splitlines()
     assert json.loads(lines[0]) == {"x": 1}
     assert [Entry(*json.loads(line)) for line in lines[1:]] == ENTRIES[:done]
 
@@ -455,7 +454,8 @@ def test_what_a_killed_run_left_half_written_is_taken_away(
     with atomic_write(tmp_path / "000000.label") as part:
         part.write_bytes(b"complete")
     part.write_bytes(b"half")  # under the name that a file has until it is whole
-    Journal(tmp_path, settings_of(world)).add(Entry("000000.npz", "", "", 1, 0))
+    with Journal(tmp_path, settings_of(world)) as journal:
+        journal.add(Entry("000000.npz", "", "", 1, 0))
 
     succeed(predict(world, tmp_path, "--overwrite"))
     assert files(tmp_path) == files(whole) | {".notes.part"}

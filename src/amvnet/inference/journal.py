@@ -44,6 +44,8 @@ class Journal:
     missing or torn: these scans are done again. If a scan is in the journal, its output is on the
     disk, because `atomic_write` puts it there first.
 
+    Leaving a `with` block closes the file; the run stays unfinished unless `close` ended it.
+
     Args:
         folder: the output folder; it is made if it is missing.
         settings: all that the output depends on, in JSON types.
@@ -70,6 +72,12 @@ class Journal:
             for path in folder.rglob(UNFINISHED_FILES):  # earlier runs did not finish these files
                 if path.is_file():
                     path.unlink()
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
 
     def add(self, entry: Entry) -> None:
         """Add the entry of a scan that is done."""

@@ -138,17 +138,17 @@ class Pipeline:
         done = self._still_done(earlier)
         remaining = [scan for scan in self.scans if _key(scan) not in done]
 
-        journal = Journal(folder, settings, done.values())
         faults = []
-        for count, outcome in enumerate(self.stream(remaining, self.write_or_explain)):
-            progress(count, len(remaining))
-            if isinstance(outcome, Entry):
-                journal.add(outcome)
-            else:
-                faults.append(outcome)
-        progress(len(remaining), len(remaining))
+        with Journal(folder, settings, done.values()) as journal:
+            for count, outcome in enumerate(self.stream(remaining, self.write_or_explain)):
+                progress(count, len(remaining))
+                if isinstance(outcome, Entry):
+                    journal.add(outcome)
+                else:
+                    faults.append(outcome)
+            progress(len(remaining), len(remaining))
+            entries = journal.close()
 
-        entries = journal.close()
         if is_new:
             with suppress(OSError):  # the folder is empty only if all scans were broken
                 folder.rmdir()

@@ -122,8 +122,9 @@ class ScoreFolder:
     def _load(self, path: Path) -> np.ndarray:
         """Return the array of a file. Pickled objects are never loaded."""
         message = f"{path}: expected NumPy scores, found a broken file; write it again"
-        with one_line_errors(lambda _: message, only=READ_ERRORS):
-            content = np.load(path, allow_pickle=False)
+        # Opened here, because NumPy leaves the file open if an array in it is broken.
+        with one_line_errors(lambda _: message, only=READ_ERRORS), path.open("rb") as file:
+            content = np.load(file, allow_pickle=False)
             if isinstance(content, np.ndarray):
                 return content
 
