@@ -1,3 +1,5 @@
+"""Install the node as a package of ROS 2."""
+
 from pathlib import Path
 from xml.etree import ElementTree
 

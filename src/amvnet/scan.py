@@ -121,13 +121,15 @@ def check_scan(scan: Scan) -> Scan:
 class TensorLike(Protocol):
     """What is used of a tensor of torch."""
 
-    def detach(self) -> Any: ...
+    def detach(self) -> Any:
+        """Return the tensor without its gradient."""
 
 
 class TableLike(Protocol):
     """What is used of a table of pandas."""
 
-    def to_records(self, *, index: bool) -> Any: ...
+    def to_records(self, *, index: bool) -> Any:
+        """Return the rows as an array of records."""
 
 
 AnyArray = np.ndarray | Sequence[Any] | TensorLike | TableLike  # what `as_array` takes

@@ -136,6 +136,7 @@ class SemanticKittiLayout:
 
     @property
     def folder(self) -> Path:
+        """The folder of the sequence."""
         return self.place(self.out, self.number)[0]
 
     def write_scan(self, index: int, scan: SimulatedScan) -> None:
@@ -180,6 +181,7 @@ class NuScenesLayout:
 
     @property
     def name(self) -> str:
+        """The name of the scene."""
         return f"simulated-{self.number:04d}"
 
     def write_scan(self, index: int, scan: SimulatedScan) -> None:
@@ -246,6 +248,7 @@ class RobotLayout:
 
     @property
     def folder(self) -> Path:
+        """The folder of the sequence."""
         return self.out / _site(self.number)
 
     def write_scan(self, index: int, scan: SimulatedScan) -> None:

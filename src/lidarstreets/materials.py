@@ -54,6 +54,7 @@ class Label(IntEnum):
     raw: int
 
     def __new__(cls, value: int, category: str, raw: int | None = None) -> Label:
+        """Make a label whose raw id is its value, unless `raw` is given."""
         label = int.__new__(cls, value)
         label._value_ = value
         label.category = category
@@ -139,6 +140,7 @@ class Surface(IntEnum):
     reflection: Reflection
 
     def __new__(cls, reflection: Reflection) -> Surface:
+        """Make a surface whose value is its row in tables of all surfaces."""
         row = len(cls.__members__)
         surface = int.__new__(cls, row)
         surface._value_ = row

@@ -11,6 +11,7 @@ PARAMETERS = Path(__file__).parents[1] / "config" / "segment.yaml"
 
 
 def generate_launch_description():
+    """Return the node and its arguments."""
     points = DeclareLaunchArgument(
         "points", default_value="points", description="topic of the scans (PointCloud2)"
     )

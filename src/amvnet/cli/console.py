@@ -159,6 +159,7 @@ class ProgressLines:
         self.tenths = Tenths()
 
     def __call__(self, done: int, total: int) -> None:
+        """Report the progress if another tenth of the work is done."""
         if self.tenths.ends(done, total):
             pace = self._pace(done, total, time.monotonic() - self.start)
             report(f"{self.title}: {done} of {total}, {pace}")

@@ -45,6 +45,7 @@ class Parser(argparse.ArgumentParser):
         self._words: Sequence[str] = ()  # what is being parsed
 
     def error(self, message: str) -> NoReturn:
+        """Raise InputError with argparse's message as a line that says what to do."""
         line = " ".join(message.split())
         unknown = re.match(r"unrecognized arguments: (.*)", line)
         missing = re.match(r"the following arguments are required: (.*)", line)
@@ -58,6 +59,7 @@ class Parser(argparse.ArgumentParser):
         raise InputError(line if line.endswith("?") else f"{line}; see {self.prog} --help")
 
     def print_help(self, file: Any = None) -> None:
+        """Print the help to the console; `file` is argparse's, and not used."""
         report_lines(self.format_help().rstrip())
 
     def values(self, arguments: Sequence[str]) -> dict[str, Any]:

@@ -110,7 +110,6 @@ def analyze(
 @torch.inference_mode()
 def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> Analysis:
     """Score a scan by every method, and by the head on all points that some tau selects."""
-
     batch = segmenter.batch([scan])
     scores = segmenter.engine.score(batch)
     f = scores.rv

@@ -101,6 +101,7 @@ class CallingThread(Executor):
     """
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Call the function at once; return its result or its error as a future."""
         future: Future[Any] = Future()
         try:
             future.set_result(function(*args, **kwargs))

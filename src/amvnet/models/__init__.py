@@ -1,0 +1,1 @@
+"""The networks of AMVNet, and what they compute with."""

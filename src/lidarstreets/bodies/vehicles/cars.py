@@ -40,21 +40,22 @@ class CarShape:
 
     @property
     def half(self) -> float:
+        """Half of the length, metres."""
         return self.length / 2
 
     @property
     def front(self) -> float:
-        """x of the foot of the windscreen, metres."""
+        """Position of the foot of the windscreen along x, metres."""
         return self.half - self.bonnet
 
     @property
     def rear(self) -> float:
-        """x of the foot of the rear window, metres."""
+        """Position of the foot of the rear window along x, metres."""
         return -self.half + self.boot + 0.04
 
     @property
     def roof(self) -> tuple[float, float]:
-        """x of the rear and of the front end of the roof, metres."""
+        """Positions of the rear and the front end of the roof along x, metres."""
         rise = self.height - self.belt
         front = self.front - rise * self.windscreen
         rear = self.rear + rise * self.tail

@@ -169,14 +169,17 @@ class Load:
 
     @property
     def length(self) -> float:
+        """Length along x, metres."""
         return self.front - self.rear
 
     @property
     def middle(self) -> float:
+        """Position of the middle along x, metres."""
         return (self.front + self.rear) / 2
 
     @property
     def height(self) -> float:
+        """Height from the floor to the top, metres."""
         return self.top - self.floor
 
 
