@@ -163,7 +163,7 @@ def test_rows_of_zeros_are_no_opinion(world: Path, tmp_path: Path) -> None:
     stdout = io.StringIO()
     with contextlib.redirect_stdout(stdout):
         run_fuse(world, tmp_path / "zeros", *options, a=tmp_path / "a", b=tmp_path / "b")
-    assert f"{tmp_path / 'b'} (b): no opinion of 25.0% of the points" in stdout.getvalue()
+    assert f"{tmp_path / 'b'} (b): no opinion on 25.0% of the points" in stdout.getvalue()
     assert f"{tmp_path / 'a'} (a): no opinion" not in stdout.getvalue()
     folders = {"a": tmp_path / "uniform a", "b": tmp_path / "uniform b"}
     run_fuse(world, tmp_path / "uniform", *options, **folders)

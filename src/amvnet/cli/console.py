@@ -1,7 +1,7 @@
-"""Lines, tables and progress on stdout, and faults on stderr.
+"""Print lines, tables and progress to stdout, and faults to stderr.
 
-Only this module prints. It escapes what is not printable, shortens what is long, and never fails:
-labels do not depend on whether anybody reads about them.
+Only this module prints. It escapes characters that are not printable, shortens long texts, and
+never fails, so that labels are written even if nobody can read the lines about them.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from rich.console import Console, RenderableType
 from amvnet.errors import without_secrets
 from amvnet.progress import Progress, Tenths
 
-LONGEST_LINE = 5000  # characters
-MOST_LINES = 2000  # of one text
+LONGEST_LINE = 5000  # longest line that is printed in full, characters
+MOST_LINES = 2000  # most lines that are printed of one text
 
 
 class SafeStream:
-    """stdout or stderr, by name, on which nothing fails: what cannot be written is lost."""
+    """The stream `stdout` or `stderr`, on which nothing fails. What cannot be written is lost."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -36,19 +36,19 @@ class SafeStream:
 
     @property
     def _stream(self) -> Any:
-        """The stream as it is now: tests or a progress bar may have replaced it."""
+        """The current stream, because tests or a progress bar may have replaced it."""
         stream = getattr(sys, self.name)
         return getattr(stream, "rich_proxied_file", stream)
 
     def write(self, text: str) -> None:
-        """Write a text; characters that the stream cannot encode are escaped."""
+        """Write a text. Characters that the stream cannot encode are escaped."""
         stream = self._stream
         encoding = getattr(stream, "encoding", None) or "utf-8"
         with self._losing():
             stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
 
     def flush(self) -> None:
-        """Write what is buffered."""
+        """Write the text in the buffer."""
         with self._losing():
             self._stream.flush()
 
@@ -77,7 +77,7 @@ def report(line: str) -> None:
 
 
 def report_lines(text: str) -> None:
-    """Print a text of several lines."""
+    """Print a text of several lines, but at most `MOST_LINES` of them."""
     lines = text.split("\n")
     for line in lines[:MOST_LINES]:
         report(line)
@@ -106,7 +106,10 @@ def report_fault(line: str) -> None:
 
 
 def printable(text: str) -> str:
-    """Return a text on one line: shortened, without secrets, not printable characters escaped."""
+    """Return a text on one line, without secrets, for printing.
+
+    A long text is shortened, and characters that are not printable are escaped.
+    """
     text = without_secrets(text)
     if len(text) > LONGEST_LINE:
         text = f"{text[:LONGEST_LINE]}... ({len(text):,} characters)"
@@ -123,7 +126,7 @@ def printable(text: str) -> str:
 
 
 def silence() -> None:
-    """Print nothing from now on: of several processes, one is enough."""
+    """Print nothing from now on, because another process of the job prints."""
     console.quiet = True
 
 
@@ -134,7 +137,7 @@ def on_terminal() -> bool:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield what shows progress: a bar on a terminal, elsewhere lines with the pace."""
+    """Yield a function that shows progress: as a bar on a terminal, elsewhere as lines."""
     if not on_terminal():
         yield ProgressLines(title)
         return
@@ -151,7 +154,7 @@ def progress(title: str) -> Iterator[Progress]:
 
 
 class ProgressLines:
-    """Says in at most ten lines what is done, how fast, and how long the rest takes."""
+    """Reports in at most ten lines how much is done, how fast, and how long the rest takes."""
 
     def __init__(self, title: str) -> None:
         self.title = title
@@ -165,7 +168,11 @@ class ProgressLines:
             report(f"{self.title}: {done} of {total}, {pace}")
 
     def _pace(self, done: int, total: int, elapsed: float) -> str:
-        """Return the rate and the time left: "2.1 a second, 0:01:16 left"."""
+        """Return the rate and the time left, such as "2.1 a second, 0:01:16 left".
+
+        Args:
+            elapsed: time since the start, seconds.
+        """
         rate = done / elapsed
         pace = f"{rate:.3g} a second" if rate >= 1 else f"{1 / rate:.3g} s each"
         left = timedelta(seconds=round((total - done) / rate))

@@ -1,4 +1,4 @@
-"""The command line: find the command, parse its arguments, and turn errors into one line."""
+"""Run the command line: find the command, parse its arguments, and turn errors into one line."""
 
 from __future__ import annotations
 
@@ -55,11 +55,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line, and print an error as one line to stderr.
 
     Args:
-        argv: the command and its arguments; by default the arguments of this process.
+        argv: the command and its arguments. By default, they are the arguments of this process.
 
     Returns:
-        The exit code: 0 if done, 2 if the input is wrong, 3 if only some of the inputs are broken,
-        130 after Ctrl-C, 143 after SIGTERM, 1 for anything else, such as a full disk.
+        The exit code: 0 if the work is done, 2 if the input is wrong, 3 if some of the inputs are
+        broken and the others are done, 130 after Ctrl-C, 143 after SIGTERM, and 1 after any other
+        error, such as a full disk.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     wait_passively()
@@ -75,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 code = stop.exit_code
         return code
     finally:
-        stdout.flush()  # the interpreter's own flush at the end could fail
+        stdout.flush()  # because the interpreter's own flush at the end could fail
 
 
 def _usage() -> str:
@@ -116,8 +117,8 @@ def _run_and_explain(arguments: Sequence[str]) -> int:
             report_fault(fault)
         report_fault(str(error))
         return SOME_BROKEN
-    except OSError as error:  # a full disk, for example; earlier files are still whole
-        # Some libraries raise an error without its parts.
+    except OSError as error:  # for example a full disk
+        # Some libraries raise an error without a file name or a text.
         place = error.filename or "the disk"
         report_fault(f"{place}: {error.strerror or error}; fix this and run it again")
         return FAILED
@@ -151,12 +152,12 @@ def run(command: str, arguments: Sequence[str]) -> None:
 
 
 def _parse_with_recipe(command: str, arguments: Sequence[str]) -> dict[str, Any]:
-    """Parse the arguments of a command with a recipe, whose values the options replace."""
+    """Parse the arguments of a command with a recipe, whose values its options replace."""
     from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
     from amvnet.config.recipes import load_recipe
     from amvnet.config.schema import Recipe
 
-    # The help shows the values of the recipe that is named first, else the paper's.
+    # The help shows the values of the recipe that is named, or else the values of the paper.
     asks_for_help = bool({"-h", "--help", HELP_ALL} & set(arguments))
     names_recipe = bool(arguments) and not arguments[0].startswith("-")
     shown = load_recipe(arguments[0]) if asks_for_help and names_recipe else Recipe()
@@ -178,7 +179,7 @@ def _has_several_processes() -> bool:
 
 
 def _suppress_library_warnings() -> None:
-    """Suppress warnings of libraries that are meant for developers."""
+    """Suppress warnings of libraries, which are meant for developers."""
     warnings.filterwarnings("ignore", module="lightning")
     warnings.filterwarnings("ignore", module="torch")
 

@@ -25,12 +25,13 @@ if TYPE_CHECKING:
     from amvnet.sensors.lidars import Sensor
     from amvnet.weights.file import Weights
 
-Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]  # the last two: nuScenes
+# Only nuScenes has the last two splits.
+Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
 
-FormatName = Literal["label", "npy", "ply"]  # of scan files' labels
+FormatName = Literal["label", "npy", "ply"]  # the format of label files for scan files
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
-SHOWN = 20  # names of sequences in a line
+MOST_SEQUENCES = 20  # most sequences that a line names
 
 
 @dataclass(frozen=True)
@@ -38,20 +39,20 @@ class ScanChoice:
     """Which scans of the inputs to read, and how files hold them."""
 
     split: Split = "all"
-    """of datasets, the official split."""
+    """the official split, for datasets."""
     sequences: tuple[str, ...] | None = None
-    """of datasets, these sequences or scenes instead, separated by commas."""
+    """sequences or scenes instead of a split, separated by commas, for datasets."""
     topic: str | None = None
-    """of bags, the topic of the scans; default: the only one with scans."""
+    """the topic of the scans, for bags; default: the only topic with scans."""
     columns: str | None = None
-    """of .bin, .npy and text files, what their columns hold, in order: x,y,z,intensity,ring, and
-    any other name for a column to leave out; default: by their names, or in this order."""
+    """the columns of .bin, .npy and text files in their order, such as x,y,z,intensity,ring; a
+    column with any other name is left out; default: by their names, or in this order."""
     dtype: str | None = None
-    """of .bin files, with --columns, the type of the numbers: float32, float64, ..., or one for
-    each of the columns, separated by commas; default: float32."""
+    """the type of the numbers in .bin files, with --columns: float32, float64, ..., or a type for
+    each column, separated by commas; default: float32."""
 
     def parse(self) -> ScanOptions:
-        """Return the options as the inputs take them.
+        """Return the options as `list_inputs` takes them.
 
         Raises:
             InputError: if a value cannot be parsed.
@@ -68,13 +69,17 @@ class LabelledChoice:
     """Which labelled scans of the dataset to use."""
 
     split: Split | None = None
-    """the split; default: val, and of rank: all. Without an official split or one of your own, the
-    last sequence validates."""
+    """the split; default: val, and all for rank. If there is neither an official split nor one of
+    your own, the last sequence validates."""
     sequences: tuple[str, ...] | None = None
-    """sequences or scenes instead, separated by commas."""
+    """sequences or scenes instead of a split, separated by commas."""
 
     def records(self, dataset: Dataset, default: Split = "val") -> Sequence[ScanRecord]:
-        """Return the scans, and say which; raise InputError if there are none."""
+        """Return the scans, and report which scans they are.
+
+        Raises:
+            InputError: if there are none.
+        """
         from amvnet.data.datasets.base import choose_records
 
         chosen = choose_records(dataset, self.sequences, self.split or default)
@@ -91,15 +96,21 @@ class TrainingChoice:
     """Which scans to train on and to validate with."""
 
     train_sequences: tuple[str, ...] | None = None
-    """sequences or scenes, separated by commas, to train on; default: the split's."""
+    """sequences or scenes to train on, separated by commas; default: the sequences of the split."""
     val_sequences: tuple[str, ...] | None = None
-    """sequences or scenes, separated by commas, to validate with; default: those of the split, or
-    without a split the last one."""
+    """sequences or scenes to validate with, separated by commas; default: the sequences of the
+    split, or the last sequence if there is no split."""
 
     def scans(self, dataset: Dataset, with_val: bool = False) -> TrainingScans:
-        """Return the labelled scans; if `with_val`, those to validate with are trained on as well.
+        """Return the labelled scans to train on and to validate with.
 
-        Scans that the split of a user's own dataset does not name are said.
+        Scans that are not used are reported.
+
+        Args:
+            with_val: whether to train on the scans to validate with as well.
+
+        Raises:
+            InputError: if there are no such sequences, or no scans to train on.
         """
         from amvnet.data.datasets.own import OwnScans
         from amvnet.data.datasets.select import split_records
@@ -115,14 +126,14 @@ class TrainingChoice:
         return scans
 
     def splits(self, dataset: Dataset) -> Iterator[tuple[str, Sequence[ScanRecord]]]:
-        """Yield the scans by the name of their split, also those without labels."""
+        """Yield the name of each split and its scans, including scans without labels."""
         from amvnet.data.datasets.select import named_sequences
 
         train, val = named_sequences(dataset, self.train_sequences, self.val_sequences)
-        self.scans(dataset)  # says what is not used
+        self.scans(dataset)  # reports scans that are not used
         yield "train", dataset.records(train)
         yield "val", dataset.records(val)
-        with suppress(InputError):  # there may be none
+        with suppress(InputError):  # there may be no test split
             yield "test", dataset.labelled(dataset.records(dataset.official("test")))
 
 
@@ -131,26 +142,25 @@ class SensorChoice:
     """What is known of the sensor of scan files; the rest is measured."""
 
     sensor: str | None = None
-    """of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured."""
+    """the name of the LiDAR (vlp16, os1-64, ...), or a YAML file; default: measured."""
     height: float | None = None
-    """of scan files, the sensor's height over the ground in metres; default: measured."""
+    """the height of the sensor above the ground, metres; default: measured."""
     intensity_scale: float | None = None
-    """of scan files, the largest possible intensity; default: 1, 255 or 65535, as the values
-    suggest, and spread as in the training of the weights."""
+    """the largest possible intensity; default: 1, 255 or 65535, as the values suggest, and then
+    spread as in the training of the weights."""
     unit: str | None = None
-    """of scan files, m, cm, mm or ft; default: m, or mm if they are certainly that."""
+    """the unit of the coordinates: m, cm, mm or ft; default: m, or mm if it is certain."""
     axes: str | None = None
-    """of scan files, x-forward (y left), y-forward (x right), z-forward (y down), z-down (y right)
-    or y-up (x right); default: by the ground."""
+    """the directions of the axes: x-forward (y left), y-forward (x right), z-forward (y down),
+    z-down (y right) or y-up (x right); default: by the ground."""
     rotate: str | None = None
-    """of scan files, the rotation that levels them: yaw,pitch,roll in degrees; default: by the
-    ground."""
+    """the rotation that levels the scans: yaw,pitch,roll in degrees; default: by the ground."""
     offset: str | None = None
-    """of scan files, what to add to x,y,z after the rotation, in metres, so that the sensor is at
-    the origin."""
+    """the vector x,y,z in metres that is added after the rotation, so that the sensor is at the
+    origin; default: 0,0,0."""
 
     def parse(self) -> Sensor:
-        """Return what is known of the sensor.
+        """Return the sensor with the attributes that are known.
 
         Raises:
             InputError: if there is no such sensor or file, or a value is impossible.
@@ -167,22 +177,27 @@ class LabelChoice:
     method: MethodName = "amvnet"
     """the whole of AMVNet, or a part of it."""
     tau: Share | None = None
-    """points whose probabilities by the two networks have a cosine similarity of at most this go to
-    the head, in [0, 1]; fewer points take less time; default: that of the weights."""
+    """the highest cosine similarity of the two networks' probabilities at which a point goes to the
+    head, in [0, 1]; a lower value takes less time; default: the value in the weights."""
     format: FormatName = "label"
-    """of scan files' labels: raw ids alone (label, npy), or coloured points (ply)."""
+    """the format of the labels of scan files: raw ids (label, npy), or coloured points (ply)."""
     classes: str | None = None
-    """write the ids of these classes, to which the weights' classes are mapped: coarse, or a YAML
-    file."""
+    """other classes, to which the classes of the weights are mapped: coarse, or a YAML file."""
     scores: bool = False
     """also write the probabilities of both networks."""
     uncertain: bool = False
-    """also write which points the two networks disagree on, as NAME.uncertain.npy."""
+    """also write NAME.uncertain.npy, which marks the points on which the two networks disagree."""
 
     def parse(
         self, weights: Weights, choice: ScanChoice, known: SensorChoice, compute: Compute
     ) -> LabellingRequest:
-        """Return the request for labels of some weights.
+        """Return the request for labels by some weights.
+
+        Args:
+            weights: the weights.
+            choice: which scans to read, and how files hold them.
+            known: what is known of the sensor.
+            compute: where and how the networks are computed.
 
         Raises:
             InputError: if a value cannot be parsed, or does not fit the weights.
@@ -211,19 +226,19 @@ class ScoresChoice:
     """The scores of two other models."""
 
     scores_a: Path | None = None
-    """folder of one model's class probabilities, an .npz or .npy of shape (N, K) for each scan,
-    where predict --scores writes its own."""
+    """a folder with one model's class probabilities: for each scan an .npz or .npy of shape (N, K),
+    under the name that predict --scores gives it."""
     scores_b: Path | None = None
-    """folder of the other model's; of files of predict --scores with both networks, a is the range
-    view and b the bird's-eye view."""
+    """a folder with the other model's class probabilities. If both folders are from predict
+    --scores, a takes the range view and b the bird's-eye view."""
     logits: Literal["a", "b", "both"] | None = None
-    """which of the two are scores before softmax."""
+    """which of the two models has scores before softmax instead of probabilities."""
 
     def parse(self) -> ScorePair | None:
-        """Return the scores of two models; None if no option names any.
+        """Return the scores of the two models, or None if no option names any.
 
         Raises:
-            InputError: if only one is named, or a folder is missing.
+            InputError: if only one folder is named, or a folder is missing.
         """
         from amvnet.inference.scores import ScoreFolder, ScorePair
 
@@ -231,7 +246,7 @@ class ScoresChoice:
             return None
         if self.scores_a is None or self.scores_b is None:
             raise InputError(
-                "expected --scores-a and --scores-b, found not both; give two models' scores"
+                "expected --scores-a and --scores-b, found only one; give the scores of two models"
             )
         return ScorePair(
             ScoreFolder("a", self.scores_a, self.logits in ("a", "both")),
@@ -242,9 +257,12 @@ class ScoresChoice:
 def load_segmenter(
     weights: Weights | str, method: MethodName, compute: Compute, tau: float | None = None
 ) -> Segmenter:
-    """Return what `amvnet.load` does, for a command, and say what it computes on.
+    """Return the segmenter of `amvnet.load`, and report on which device it computes.
 
-    On a CPU, the process keeps the memory that it frees.
+    On a CPU, the process keeps the memory that it frees (`keep_freed_memory`).
+
+    Raises:
+        InputError: if `amvnet.load` cannot make the segmenter.
     """
     from amvnet import load
     from amvnet.runtime.memory import keep_freed_memory
@@ -266,7 +284,11 @@ def load_segmenter(
 
 
 def join_processes(cuda: bool = False) -> Processes:
-    """Join the processes of this job, if torchrun or SLURM started several; only one prints."""
+    """Join the processes of this job, if torchrun or SLURM started several. Only one prints.
+
+    Args:
+        cuda: whether the processes compute on CUDA devices.
+    """
     from amvnet.runtime.distributed import join
 
     processes = join(cuda)
@@ -276,12 +298,12 @@ def join_processes(cuda: bool = False) -> Processes:
 
 
 def describe_records(records: Sequence[ScanRecord]) -> str:
-    """Return in words how many scans there are, and from which sequences."""
+    """Return in words the number of some scans, and the names of their sequences."""
     if not records:
         return "none"
     names = sorted({record.sequence for record in records})
-    text = ", ".join(names[:SHOWN])
-    if len(names) > SHOWN:
-        text += f" and {len(names) - SHOWN} more"
+    text = ", ".join(names[:MOST_SEQUENCES])
+    if len(names) > MOST_SEQUENCES:
+        text += f" and {len(names) - MOST_SEQUENCES} more"
 
     return f"{counted(len(records), 'scan')} of {text}"

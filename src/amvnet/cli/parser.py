@@ -17,12 +17,13 @@ from amvnet.cli.console import report_lines
 from amvnet.config.bounds import Range
 from amvnet.errors import InputError, did_you_mean, shown
 
-NUMBERS = {int: "a whole number", float: "a number"}
-METAVARS = {"inputs": "INPUT", "weights": "W"}  # of arguments; that of others is their name
+NUMBERS = {int: "a whole number", float: "a number"}  # what messages call the types of numbers
+# What stands for an argument in the help. Other arguments are shown by their name in capitals.
+METAVARS = {"inputs": "INPUT", "weights": "W"}
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Writes the default of an option after its text, unless the text states it."""
+    """A formatter that writes the default of an option after its text, unless the text has it."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=30)
@@ -40,9 +41,9 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
-        self._negative_number_matcher = re.compile(r"-\.?\d")  # also -1,0,0 is no option
-        self.kinds: dict[str, Any] = {}  # types of the values, by name
-        self._words: Sequence[str] = ()  # what is being parsed
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # so that -1,0,0 is a value
+        self.kinds: dict[str, Any] = {}  # the types of the values by name
+        self._words: Sequence[str] = ()  # the words that are being parsed
 
     def error(self, message: str) -> NoReturn:
         """Raise InputError with argparse's message as a line that says what to do."""
@@ -52,7 +53,7 @@ class Parser(argparse.ArgumentParser):
         if unknown is not None:
             line = self._unknown(unknown[1])
         elif missing is not None:
-            # A wrong name of the missing option says more than that it is missing.
+            # A misspelt option helps the user more than the missing option.
             wrong = self._wrong_option()
             line = f"expected {missing[1]}, found none; add what is missing"
             line = line if wrong is None else self._unknown(wrong)
@@ -63,7 +64,7 @@ class Parser(argparse.ArgumentParser):
         report_lines(self.format_help().rstrip())
 
     def values(self, arguments: Sequence[str]) -> dict[str, Any]:
-        """Return the values of all arguments and options by name, in their types.
+        """Return the values of all arguments and options by name, converted to their types.
 
         Raises:
             InputError: if an argument is missing or unknown, or a value is not of its type.
@@ -80,7 +81,7 @@ class Parser(argparse.ArgumentParser):
         return [known for action in self._actions for known in action.option_strings]
 
     def _wrong_option(self) -> str | None:
-        """Return the first word that looks like an option and is none."""
+        """Return the first word that looks like an option but is unknown, or None."""
         for word in self._words:
             if word == "--":
                 break
@@ -98,7 +99,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _convert(flag: str, text: str, kind: Any) -> Any:
-    """Convert the text of an option to its type; raise InputError if it does not fit."""
+    """Convert the text of an option to its type; raise InputError if that is impossible."""
     item_kind = _item_kind_of(kind)
     if item_kind is not None:
         texts = list(filter(None, map(str.strip, text.split(","))))
@@ -137,7 +138,7 @@ def _convert(flag: str, text: str, kind: Any) -> Any:
 
 
 def _item_kind_of(kind: Any) -> Any:
-    """Return the type of the items of a tuple, also of an optional one; else None."""
+    """Return the type of the items if a type is a tuple or an optional tuple, else None."""
     for part in (kind, *get_args(kind)):
         if get_origin(part) is tuple:
             return get_args(part)[0]
@@ -152,7 +153,7 @@ def _parts_of(kind: Any) -> Iterator[Any]:
 
 
 def literals(kind: Any) -> tuple[str, ...]:
-    """Return the values of a Literal, also of an optional one; none of any other type."""
+    """Return the values of a Literal or of an optional Literal; no values for other types."""
     for part in (kind, *get_args(kind)):
         if get_origin(part) is Literal:
             return get_args(part)
@@ -163,9 +164,11 @@ def make_parser(command: str, run: Callable[..., None]) -> Parser:
     """Return the parser of a command, without the values of a recipe.
 
     Args:
-        run: does the work; its signature and docstring define the arguments and options.
-            Positional-only parameters are arguments. A parameter that is a dataclass stands for a
-            group of options, one for each field, with the line under the field as its help.
+        command: the name of the command.
+        run: the function that does the work. Its signature and its docstring define the arguments
+            and the options. Positional-only parameters are arguments. A parameter of a dataclass
+            type stands for a group of options. Each field of the dataclass is an option, and the
+            text under the field is its help.
     """
     docs = docstring_parser.parse(run.__doc__ or "")
     texts = {param.arg_name: param.description or "" for param in docs.params}
@@ -197,12 +200,17 @@ def make_parser(command: str, run: Callable[..., None]) -> Parser:
 
 
 def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
-    """Run a command with the values of its options, some of which are fields of dataclasses."""
+    """Run a command with the values of its options.
+
+    Args:
+        run: the function of the command.
+        values: the values by the name of the argument or option.
+    """
     hints = get_type_hints(run)
     arguments = []
     for name in inspect.signature(run).parameters:
         kind = hints[name]
-        if name in values:  # also a recipe, which is a dataclass with options of its own
+        if name in values:  # also a recipe, although it is a dataclass
             arguments.append(values[name])
         else:
             own = {field.name: values[field.name] for field in dataclasses.fields(kind)}
@@ -211,7 +219,7 @@ def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
 
 
 def _is_bundle(kind: Any) -> bool:
-    """Return whether a type is a dataclass, whose fields are options."""
+    """Return whether a type is a dataclass, so that its fields are options."""
     return isinstance(kind, type) and dataclasses.is_dataclass(kind)
 
 
@@ -226,7 +234,7 @@ def _add_argument(parser: Parser, name: str, kind: Any, metavar: str, text: str)
 
 
 def _add_option(target: Any, name: str, kind: Any, default: Any, text: str) -> None:
-    """Add one parameter of a command as an option to the parser, or to a group of it."""
+    """Add one parameter of a command as an option to the parser, or to one of its groups."""
     options: dict[str, Any] = {"help": text.replace("%", "%%")}
     if default is inspect.Parameter.empty:
         options["required"] = True
@@ -236,7 +244,7 @@ def _add_option(target: Any, name: str, kind: Any, default: Any, text: str) -> N
 
     if kind is bool:
         options["action"] = "store_true"
-    elif get_origin(kind) is list:  # may be given several times
+    elif get_origin(kind) is list:  # an option that may be given several times
         options |= {"action": "append", "metavar": name.upper()}
     else:
         options["metavar"] = metavar_of(name, kind)
@@ -244,12 +252,12 @@ def _add_option(target: Any, name: str, kind: Any, default: Any, text: str) -> N
 
 
 def flag_of(name: str) -> str:
-    """Return the option of a parameter, with dashes instead of underscores."""
+    """Return the name of a parameter's option, with dashes instead of underscores."""
     return "--" + name.replace("_", "-")
 
 
 def metavar_of(name: str, kind: Any) -> str:
-    """Return what stands for an option's value in the help: its choices, or its name."""
+    """Return the word for an option's value in the help: its choices, or its name."""
     choices = literals(kind) if _item_kind_of(kind) is None else ()
     if choices:
         return "{" + ",".join(choices) + "}"

@@ -1,4 +1,4 @@
-"""Every value of a recipe as an option with dots, such as --training.rv.epochs 40."""
+"""Add every value of a recipe as an option with dots, such as --training.rv.epochs 40."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ HELP_ALL = "--help-all"
 
 
 def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
-    """Add the values of a recipe as options, which the help shows if `shows_all`."""
+    """Add the values of a recipe as options.
+
+    Args:
+        shows_all: whether the help shows these options.
+    """
     parser.add_argument(
         HELP_ALL,
         action="help",
@@ -43,10 +47,13 @@ def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
 
 
 def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
-    """Return a recipe with the values of the options whose names have dots.
+    """Return a recipe whose values are replaced by the options that have dots in their names.
+
+    Args:
+        values: the texts of all options by name; None for an option that is not given.
 
     Raises:
-        InputError: if a value does not fit.
+        InputError: if a value has the wrong type or is out of its range.
     """
     tree: dict[str, Any] = {}
     for name, text in values.items():
@@ -66,7 +73,7 @@ def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
 
 
 def _walk(config: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield a dataclass and those in it, each with its path."""
+    """Yield a dataclass and all dataclasses inside it, each with its path."""
     yield path, config
     for key, value in vars(config).items():
         if dataclasses.is_dataclass(value):
@@ -74,7 +81,7 @@ def _walk(config: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _to_text(value: Any) -> str:
-    """Return a value as users write it."""
+    """Return the text of a value as users write it."""
     if isinstance(value, tuple):
         return "[" + ",".join(map(str, value)) + "]"
     return str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,4 +1,4 @@
-"""Stop on Ctrl-C or SIGTERM: within a second, with one line and the signal's exit code."""
+"""Stop on Ctrl-C or SIGTERM within a second, with one line and the exit code of the signal."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ SECONDS_TO_END = 0.6  # time that a command has to end by itself, seconds
 
 
 class Stop:
-    """Whether a signal has asked the command to stop, and how it stops.
+    """A request to stop, which a signal may make.
 
     Args:
-        line: what is said when the command has stopped.
-        exits: whether this process belongs to the command line, and ends with the command.
+        line: the line to print when the command has stopped.
+        exits: whether this process belongs to the command line, and so ends with the command.
+
+    Attributes:
+        signal: number of the signal, or None if there was none.
     """
 
     def __init__(self, line: str, exits: bool) -> None:
@@ -35,18 +38,18 @@ class Stop:
 
     @property
     def exit_code(self) -> int:
-        """128 + the number of the signal: 130 after Ctrl-C, 143 after SIGTERM."""
+        """The number of the signal + 128: 130 after Ctrl-C, 143 after SIGTERM."""
         assert self.signal is not None
         return 128 + self.signal
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Raise KeyboardInterrupt; the process exits if that does not end the command soon."""
-        if os.getpid() != self._process:  # a worker has this handler from the process that forked
+        """Raise KeyboardInterrupt, and exit soon if that does not end the command."""
+        if os.getpid() != self._process:  # a forked worker, which has inherited this handler
             os._exit(128 + number)
         is_second = self.signal is not None
         self.signal = number
         if self.exits:
-            # An exception within the C++ code that torch runs when it is imported aborts.
+            # An exception while torch is imported would abort the process within C++ code.
             if is_second or _is_importing(frame):
                 self.end()
             deadline = threading.Timer(SECONDS_TO_END, self._insist)
@@ -55,16 +58,16 @@ class Stop:
         raise KeyboardInterrupt
 
     def _insist(self) -> None:
-        """End the processes that the command may be waiting for, and then this one."""
+        """End the processes that the command may be waiting for, and then this process."""
         for child in multiprocessing.active_children():
             child.kill()
         time.sleep(SECONDS_TO_END / 3)
         self.end()
 
     def end(self) -> None:
-        """Say that the command has stopped; end the process if it is the command line's.
+        """Report that the command has stopped. End the process if it belongs to the command line.
 
-        It leaves no half-written file. Threads that still compute are not waited for.
+        No half-written file is left. Threads that still compute are not waited for.
         """
         if not self._ending.acquire(blocking=False):
             return
@@ -77,7 +80,7 @@ class Stop:
                 shutil.rmtree(path, ignore_errors=True)
             else:
                 path.unlink(missing_ok=True)
-        console.show_cursor()  # a bar hides it
+        console.show_cursor()  # because a progress bar hides it
         stdout.flush()
         os._exit(self.exit_code)
 
@@ -93,12 +96,18 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 @contextmanager
 def stoppable(line: str, exits: bool) -> Iterator[Stop]:
-    """Yield a `Stop`, which raises a KeyboardInterrupt in the block at SIGINT and SIGTERM."""
+    """Yield a `Stop`, which raises KeyboardInterrupt in the block at SIGINT or SIGTERM.
+
+    Args:
+        line: the line to print when the command has stopped.
+        exits: whether this process belongs to the command line.
+    """
     stop = Stop(line, exits)
     earlier = {}
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as in the background of a shell
+            # A shell lets commands in the background ignore SIGINT.
+            if signal.getsignal(number) is not signal.SIG_IGN:
                 earlier[number] = signal.signal(number, stop.handle)
     try:
         yield stop

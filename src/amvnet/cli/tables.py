@@ -1,4 +1,4 @@
-"""Tables for people: of an evaluation, of times, and of what is installed."""
+"""Make the tables that commands print."""
 
 from __future__ import annotations
 
@@ -24,9 +24,13 @@ from lidarstreets import LIDAR_MODELS
 
 
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
-    """Return the table of an `Evaluation.report`: a row per class, a column per method.
+    """Return the table of an evaluation, with a row for each class and a column for each method.
 
-    The overall figures and the mIoU by distance are below the classes.
+    The overall figures and the mIoU by distance follow below the classes.
+
+    Args:
+        report: the result of `Evaluation.report`.
+        taxonomy: the classes of the evaluation.
     """
     methods = report["methods"]
     figures = list(methods.values())
@@ -44,7 +48,7 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     for key, row_title in OVERALL.items():
         table.add_row(row_title, *[_percent(method[key]) for method in figures])
     table.add_section()
-    # One row per range of distances, with the figures of each method in it.
+    # Each row is a range of distances, and has the figures of all methods.
     for row in zip(*[method["by_distance"] for method in figures], strict=True):
         row_title = f"mIoU, {row[0]['from_m']:.0f} to {row[0]['to_m']:.0f} m"
         table.add_row(row_title, *[_percent(figure["miou"]) for figure in row])
@@ -55,7 +59,7 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 
 
 def contents_table(report: Report) -> Table:
-    """Return the table of what the labelled scans of a dataset hold: points and scans by class."""
+    """Return the table of the points and the scans of each class in a dataset."""
     table = Table(title=report.spec, show_edge=False)
     table.add_column("class")
     splits = {name: split for name, split in report.splits.items() if split.scans}
@@ -82,7 +86,7 @@ def contents_table(report: Report) -> Table:
 
 
 def unknown_table(report: Report) -> Table:
-    """Return the table of the ids that are neither of a class nor ignored."""
+    """Return the table of the ids that belong to no class and are not ignored."""
     table = Table(title="ids of no class", show_edge=False)
     table.add_column("id", justify="right")
     table.add_column("points", justify="right")
@@ -94,7 +98,7 @@ def unknown_table(report: Report) -> Table:
 
 
 def timing_table(report: Mapping[str, Any]) -> Table:
-    """Return the table of a report of `time_runs`: the time of each stage."""
+    """Return the table of the time of each stage, given a report of `time_runs`."""
     points = report["points"]
     title = (
         f"{report['engine']} on {report['device']} in {report['precision']}, "
@@ -123,7 +127,7 @@ def timing_table(report: Mapping[str, Any]) -> Table:
 
 
 def _times(spread: Mapping[str, float]) -> tuple[str, str]:
-    """Return the median and the range between the quartiles, in milliseconds."""
+    """Return the texts of the median and of the range between the quartiles, milliseconds."""
     return f"{spread['median']:.1f}", f"{spread['low']:.1f} to {spread['high']:.1f}"
 
 
@@ -185,10 +189,10 @@ def sensors_table() -> Table:
 
 
 def installation_table() -> Table:
-    """Return the table of what is installed: versions, devices, built-in weights and recipes."""
+    """Return the table of the installation: versions, devices, built-in weights and recipes."""
     table = Table(title="AMVNet", show_header=False, show_edge=False)
     required = [re.split(r"[^\w.-]", line)[0] for line in metadata.requires("amvnet") or ()]
-    for name in ("amvnet", *dict.fromkeys(required)):  # several extras may name a package
+    for name in ("amvnet", *dict.fromkeys(required)):  # each package once
         table.add_row(name, _version(name))
     table.add_row("python", platform.python_version())
 
@@ -210,5 +214,5 @@ def _version(name: str) -> str:
 
 
 def _percent(value: float | None) -> str:
-    """Return a share as a percentage, and a dash for None."""
+    """Return the text of a share as a percentage, or a dash if there is no value."""
     return "–" if value is None else f"{100 * value:.1f}"

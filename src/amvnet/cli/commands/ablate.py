@@ -8,7 +8,7 @@ from amvnet.cli.console import on_terminal, report, report_lines
 from amvnet.cli.options import TrainingChoice, describe_records, join_processes
 from amvnet.config.schema import Recipe
 
-TABLE = "ablation"  # name of the table, without an ending
+TABLE = "ablation"  # name of the table's file, without its ending
 
 
 def ablate(
@@ -22,12 +22,12 @@ def ablate(
     """Train the range-view network with and without GRU and class weights: the paper's Table 5.
 
     Args:
-        recipe: what to train; a built-in recipe's name or a YAML file.
+        recipe: the name of a built-in recipe, or a YAML file.
         data: the dataset.
         out: folder for the four runs and the table; a second call continues an interrupted one.
-        choice: which scans to train on; those to validate with are scored.
-        device: where the trained networks are scored: cpu, cuda, cuda:1, ..., or auto: cuda if
-            there is a GPU.
+        choice: which scans to train on, and which to score.
+        device: the device that scores the trained networks: cpu, cuda, cuda:1, ..., or auto, which
+            is cuda if there is a GPU.
     """
     from amvnet.evaluation import charts
     from amvnet.outputs import check_outputs

@@ -34,17 +34,17 @@ def analyze(
     Args:
         data: the dataset, with labels.
         weights: a weights file, or the name of a built-in one.
-        out: folder for the figures (PNG), and the same figures as CSV.
+        out: folder for the diagrams (PNG), and their figures (CSV).
         choice: which scans to score.
         compute: where and how the networks are computed.
-        neighbours: also train a head for each of these numbers of neighbours, separated by commas
-            (Fig. 8b); needs a recipe.
-        taus: also train a head for each of these thresholds, separated by commas (Fig. 8a); with 1
-            it learns from points drawn from all; needs a recipe.
-        recipe: how these heads are trained: a built-in recipe's name or a YAML file.
-        train_sequences: sequences or scenes, separated by commas, that these heads learn from;
+        neighbours: numbers of neighbours, separated by commas; a head is trained for each of them
+            (Fig. 8b); needs --recipe.
+        taus: thresholds, separated by commas; a head is trained for each of them (Fig. 8a); with a
+            threshold of 1, it learns from all kinds of points; needs --recipe.
+        recipe: the recipe of these heads: the name of a built-in recipe, or a YAML file.
+        train_sequences: sequences or scenes that these heads learn from, separated by commas;
             default: the official split.
-        overwrite: replace figures that exist.
+        overwrite: replace files that exist.
     """
     from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.open import open_dataset

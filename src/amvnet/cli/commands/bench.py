@@ -25,10 +25,11 @@ def bench(
     Args:
         compute: where and how the networks are computed; one scan is timed at a time.
         weights: a weights file, or the name of a built-in one.
-        scan: the scan to time with; by default a simulated one.
-        runs: the number of timed runs, after two warm-up runs; medians and quartiles are shown.
-        tau: the cosine similarity of the two networks' probabilities up to which points are
-            uncertain, in [0, 1]; default: that of the weights.
+        scan: the file of the scan; default: a simulated scan.
+        runs: the number of timed runs, after two warm-up runs; the table shows medians and
+            quartiles.
+        tau: the highest cosine similarity of the two networks' probabilities at which a point is
+            uncertain, in [0, 1]; default: the value in the weights.
         json: also write the figures to this file.
         overwrite: replace this file if it exists.
     """

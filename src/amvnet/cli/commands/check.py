@@ -13,7 +13,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
 
     Args:
         data: the dataset.
-        choice: which scans to check; also the labelled scans of the test split.
+        choice: which scans to check, besides the labelled scans of the test split.
     """
     from amvnet.cli.tables import contents_table, unknown_table
     from amvnet.data.check import check_scans

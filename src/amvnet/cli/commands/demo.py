@@ -8,19 +8,19 @@ from amvnet.cli.commands.evaluate import show_evaluation
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import WEIGHTS
 
-SEED = 20_201_209  # far from the seeds of the streets that the built-in weights were trained on
-SCANS = 3
-SEQUENCES = 3
+SEED = 20_201_209  # the default seed, far from the seeds of the built-in weights' training streets
+SCANS = 3  # number of scans of each street
+SEQUENCES = 3  # number of streets
 
 
 def demo(
     out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS, overwrite: bool = False
 ) -> None:
-    """Simulate streets, segment them, score the labels, and write a page that shows all in 3D.
+    """Simulate streets, segment them, score the labels, and write a page that shows them in 3D.
 
     Args:
         out: folder for the scans, the page and the figures.
-        seed: of the streets; the default gives streets the built-in weights were not trained on.
+        seed: the seed of the streets; the built-in weights were not trained on the default's.
         weights: a weights file, or the name of a built-in one.
         overwrite: replace the page and the figures if they exist.
     """
@@ -45,7 +45,7 @@ def demo(
             f"simulated streets have, found {', '.join(classes)[:200]}; use amvnet view and "
             "amvnet evaluate on scans with these classes"
         )
-    # Scans of another seed in the same folder would be taken for this seed's.
+    # Each seed has its own folder, because scans in one folder are taken for one dataset.
     data = out / "data" / f"{sensors[0]}-{seed}"
     with progress("simulating") as step:
         simulate(

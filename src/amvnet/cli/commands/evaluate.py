@@ -37,15 +37,16 @@ def evaluate(
         data: the dataset.
         choice: which scans to score.
         compute: where and how the networks are computed.
-        weights: a weights file, or the name of a built-in one: all methods are scored.
+        weights: a weights file, or the name of a built-in one.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
-        methods: what to score of weights, separated by commas; rv-knn is rv with a vote of
-            neighbours in the range image, arithmetic and maximum are the other ensembles.
-        tau: points whose probabilities by the two networks have a cosine similarity of at most this
-            go to the head, in [0, 1]; fewer points take less time; default: that of the weights.
+        methods: the methods of the weights to score, separated by commas; rv-knn is rv with a vote
+            of neighbours in the range image, arithmetic and maximum are the other ensembles.
+        tau: the highest cosine similarity of the two networks' probabilities at which a point goes
+            to the head, in [0, 1]; a lower value takes less time; default: the value in the
+            weights.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
-        classes: score these classes instead, to which those of the data and of the weights are
+        classes: other classes to score, to which the classes of the data and of the weights are
             mapped: coarse, or a YAML file.
         overwrite: replace figures and drawings that exist.
     """
@@ -84,7 +85,7 @@ def evaluate(
             "expected either --weights or --predictions, found both or neither; give one of them"
         )
 
-    # Before any scan is scored, so that no time is wasted if a file cannot be written.
+    # Check this before any scan is scored, so that no time is wasted if a file cannot be written.
     outputs = {} if pictures is None else pictures_of(records, pictures)
     if json is not None:
         outputs[json] = REPORT
@@ -92,7 +93,8 @@ def evaluate(
     for path in (json, pictures):
         if path is not None:
             make_folder(path.parent)
-    processes.wait()  # until no process takes a new drawing of another one for an old one
+    # No process writes a drawing before all have checked that there are none.
+    processes.wait()
     with progress("scoring") as step:
         evaluation = evaluate_records(
             dataset,
@@ -109,7 +111,13 @@ def evaluate(
 def show_evaluation(
     evaluation: Evaluation, dataset: str, path: Path | None, tau: float | None = None
 ) -> None:
-    """Print the table, and write the same figures as JSON if there is a path."""
+    """Print the table of an evaluation, and write its figures as JSON if there is a path.
+
+    Args:
+        dataset: the name of the dataset, for the title.
+        path: the file to write, or None to write none.
+        tau: the threshold of the assertion if the user chose it.
+    """
     from amvnet.cli.tables import evaluation_table
     from amvnet.files import atomic_write
 

@@ -8,13 +8,13 @@ from amvnet.cli.console import progress, report
 
 
 def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = False) -> None:
-    """Write the networks and the head as ONNX, with a JSON that a program in C++ can follow.
+    """Write the networks and the head as ONNX graphs, with a JSON that a C++ program can follow.
 
     Args:
         weights: a weights file, or the name of a built-in one.
         out: folder for the graphs and amvnet.json.
-        int8: convert the convolutions to 8-bit integers, for CPUs, calibrated with these scans: a
-            dataset, scan files or a folder of them as predict takes them, or the word simulated.
+        int8: scans that calibrate convolutions in 8-bit integers, for CPUs: a dataset, scan files
+            or a folder of them as predict takes them, or the word simulated; default: float32.
         overwrite: replace files that exist.
     """
     from amvnet.export.onnx import export as export_weights
@@ -27,10 +27,10 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
     report(f"{len(graphs)} graphs and amvnet.json in {out}")
     differences = [graph["difference"] for graph in graphs.values() if "difference" in graph]
     if differences:
-        report(f"those in float32 differ from torch by at most {max(differences):.1e}")
+        report(f"graphs in float32 differ from torch by at most {max(differences):.1e}")
     for name, graph in graphs.items():
         if "agreement" in graph:
             report(
-                f"{name} is in int8 now; on scans it was not calibrated with, "
-                f"{graph['agreement']:.1%} of its labels are as before"
+                f"{name} is in int8; on scans that did not calibrate it, "
+                f"{graph['agreement']:.1%} of its labels are unchanged"
             )

@@ -30,17 +30,17 @@ def fleet(
     Args:
         inputs: folders of scan files, scan files, or manifests (.parquet, .csv): URLs or paths.
         weights: a weights file, or the name of a built-in one.
-        out: folder for the labels: a URL or a path; new, or with --resume that of an earlier run.
+        out: folder for the labels, a URL or a path; it must be new unless --resume is given.
         known: what is known of the sensor of scan files.
         compute: where and how the networks are computed.
         labels: how points are labelled, and which files are written.
-        columns: as of predict.
-        dtype: as of predict.
+        columns: the columns of .bin, .npy and text files in their order, as predict takes them.
+        dtype: the type of the numbers in .bin files, as predict takes it.
         batch: scans that go through the networks at a time; more than one suits a GPU.
-        resume: continue an earlier run into the folder: label only the scans that are new, failed,
-            or whose labels are gone, with the same weights and options.
+        resume: continue an earlier run in the folder, with the same weights and options; only scans
+            that are new, failed, or have lost their labels are labelled.
         address: the Ray cluster: auto, ray://HOST:10001, ...; default: Ray starts on this machine.
-        workers: at most so many; default: one for each GPU, or for each 4 cores.
+        workers: the highest number of workers; default: one for each GPU, or for each 4 cores.
     """
     from amvnet.weights.file import load
 

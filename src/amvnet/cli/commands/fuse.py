@@ -23,18 +23,18 @@ def fuse(
     taxonomy: Literal["semantickitti", "nuscenes"] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Fuse the scores of any two models: labels by the point head, or by the ensemble.
+    """Fuse the scores of any two models into labels, by the point head or by the ensemble.
 
     Args:
         inputs: datasets, scan files, or folders of scans.
         out: folder for the labels.
-        models: their scores.
+        models: the scores of the two models.
         choice: which scans of the inputs.
-        head: weights with a point head, trained with these scores or with networks; without, the
-            ensemble is used.
-        tau: points whose scores have a cosine similarity of at most this are uncertain; default:
-            the head's.
-        taxonomy: the classes; default: the head's or the inputs'.
+        head: weights with a point head that was trained on these scores or on networks; default: no
+            head, but the ensemble.
+        tau: the highest cosine similarity of the two models' scores at which a point is uncertain,
+            in [0, 1]; default: the value in the head's weights.
+        taxonomy: the classes; default: the classes of the head or of the inputs.
         overwrite: replace files that exist.
     """
     from amvnet.data.taxonomy import TAXONOMIES
@@ -44,7 +44,9 @@ def fuse(
 
     pair = models.parse()
     if pair is None:
-        raise InputError("expected --scores-a and --scores-b, found none; give two models' scores")
+        raise InputError(
+            "expected --scores-a and --scores-b, found none; give the scores of two models"
+        )
     weights = None if head is None else load(head)
     if weights is not None and taxonomy is not None:
         raise InputError(
@@ -66,6 +68,6 @@ def fuse(
     for side, share in fused.silent.items():
         if share:
             folder = models.scores_a if side == "a" else models.scores_b
-            report(f"{folder} ({side}): no opinion of {share:.1%} of the points")
+            report(f"{folder} ({side}): no opinion on {share:.1%} of the points")
     files = counted(fused.files, "label file")
     report(f"{files} in {out}; the two models disagree on {fused.uncertain:.1%} of the points")

@@ -6,10 +6,10 @@ from amvnet.cli.console import report_lines, show
 
 
 def info(weights: str | None = None, /) -> None:
-    """Describe a weights file; without one, show what is installed.
+    """Print the model card of a weights file in Markdown; without a file, show what is installed.
 
     Args:
-        weights: a weights file, or the name of a built-in one: its model card, in Markdown.
+        weights: a weights file, or the name of a built-in one.
     """
     from amvnet.cli.tables import installation_table
     from amvnet.weights.card import BUILT_IN_LICENCE, model_card

@@ -40,8 +40,8 @@ def predict(
         compute: where and how the networks are computed.
         labels: how points are labelled, and which files are written.
         batch: scans that go through the networks at a time; more than one suits a GPU.
-        resume: continue an earlier run into the folder: segment only the scans that are new or were
-            not done, with the same weights and options.
+        resume: continue an earlier run in the folder, with the same weights and options; only scans
+            that are new or were not done are segmented.
         overwrite: replace files that exist.
     """
     from amvnet.inference.predict import predict as predict_inputs

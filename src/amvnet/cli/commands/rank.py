@@ -19,12 +19,12 @@ def rank(
     compute: Compute,
     overwrite: bool = False,
 ) -> None:
-    """Rank clusters of points whose labels both views contradict, to check them.
+    """Rank clusters of points whose labels both views contradict, so that you can check them.
 
     Args:
         data: the dataset, with labels.
         weights: a weights file with both networks, or the name of a built-in one.
-        out: the table of the clusters, FILE.csv.
+        out: the file of the table, FILE.csv.
         choice: which scans to rank.
         compute: where and how the networks are computed.
         overwrite: replace the table if it exists.
@@ -37,7 +37,7 @@ def rank(
     from amvnet.ranking.label_errors import rank as rank_records
     from amvnet.weights.file import load
 
-    # Before any scan is scored, so that no time is wasted.
+    # Check this before any scan is scored, so that no time is wasted.
     check_outputs({out: TABLE}, [data, weights], overwrite)
     make_folder(out.parent)
     loaded = load(weights)

@@ -26,12 +26,14 @@ def simulate(
 
     Args:
         out: folder to write to.
-        sensor: the LiDAR: hdl64e writes SemanticKITTI's layout, hdl32e that of nuScenes-lidarseg,
-            vlp16 (on a robot) a layout of its own, which robot.yaml in the folder describes.
+        sensor: the LiDAR: hdl64e writes the layout of SemanticKITTI, hdl32e the layout of
+            nuScenes-lidarseg, and vlp16 (on a robot) a layout that robot.yaml in the folder
+            describes.
         sequences: number of sequences; each is another street.
         scans: number of scans in each sequence.
-        seed: of all randomness; the same seed gives the same bytes.
-        processes: sequences that are simulated at the same time; default: one per processor.
+        seed: the seed of all random numbers; the same seed gives the same bytes.
+        processes: number of sequences that are simulated at the same time; default: one per
+            processor.
     """
     from amvnet.data.datasets.simulated import simulate as simulate_streets
     from amvnet.files import check_no_links

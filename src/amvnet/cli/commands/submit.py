@@ -26,9 +26,10 @@ def submit(
         data: the dataset, whose scans are the reference.
         predictions: a folder of predictions in the benchmark's layout.
         out: the archive to write, NAME.zip.
-        split: the official split; the servers score test, the others are for trials.
-        sequences: sequences or scenes instead, separated by commas, for trials.
-        use_external: nuScenes: the method also learnt from data outside nuScenes.
+        split: the official split; the servers score test, the other splits are for trials.
+        sequences: sequences or scenes instead of a split, separated by commas, for trials.
+        use_external: declare that the method also learnt from data outside nuScenes (for nuScenes
+            only).
         overwrite: replace the archive if it exists.
     """
     from amvnet.data.datasets.open import open_dataset
@@ -46,8 +47,8 @@ def submit(
     with progress("packing") as step:
         count = pack.write(rules, predictions, out, use_external=use_external, progress=step)
     packed = counted(count, "prediction")
-    fit = "keeps" if count == 1 else "keep"
-    report(f"{out}: {packed} {fit} to the rules of {rules.taxonomy.name}")
+    follow = "follows" if count == 1 else "follow"
+    report(f"{out}: {packed} {follow} the rules of {rules.taxonomy.name}")
     if rules.official is not None and count < rules.official:
         report(
             f"note: the benchmark has {rules.official} scans in this split; "

@@ -25,23 +25,23 @@ def train(
     """Train the two networks and the point head.
 
     Args:
-        recipe: what to train; a built-in recipe's name or a YAML file.
+        recipe: the name of a built-in recipe, or a YAML file.
         data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts;
             a YAML file that describes scans and classes of your own (docs/own_data.md);
             simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
-            the training, with their cache in the folder. If there are several, the first is split
-            and validated, and the training scans of the others are mixed in: all of them, or as
-            many as --training.others says.
+            the training, with their cache in the folder. If several are given, the first one is
+            split and validated, and the training scans of the others are mixed in: all of them, or
+            as many as --training.others says.
         out: folder of the run.
         choice: which scans to train on and to validate with.
         models: with --stage head, two models to train a head for.
-        stage: which part to train; `all` trains one after the other.
-        init: weights to begin with; parts that are not trained are taken from them. Of weights for
-            other classes, all layers but the last ones are taken. Stages that the folder already
-            has keep their own weights.
+        stage: which part to train; all trains one part after the other.
+        init: weights to begin with; parts that are not trained are copied. If they have other
+            classes, all layers except the last ones are copied. Stages that the folder already has
+            keep their own weights.
         resume: continue an earlier run in the folder.
-        with_val: also train on the scans to validate with, as for a benchmark's server; then
-            nothing is validated.
+        with_val: also train on the scans to validate with, and validate nothing, as for a
+            benchmark's server.
     """
     from amvnet.models.methods import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
@@ -73,5 +73,5 @@ def train(
     line = f"weights in {path}"
     parts = load(path).parts
     if stage != "head" and set(BOTH_NETWORKS) <= set(parts) and "point_head" not in parts:
-        line += "; they have no point head: the same command with --stage head trains it"
+        line += "; they have no point head, which the same command with --stage head trains"
     report(line)

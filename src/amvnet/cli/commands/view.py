@@ -33,12 +33,12 @@ def view(
         known: what is known of the sensor of scan files.
         compute: where and how the networks are computed.
         labels: a folder of labels as predict writes them, in any of its formats, or the label file
-            of one scan.
-        weights: instead, a weights file, or the name of a built-in one: the labels of every method
-            are shown.
-        html: the page to write; by default a temporary one, which opens in the browser.
-        scans: at most this many, evenly spaced.
-        taxonomy: the classes of labels without a dataset.
+            of a single scan.
+        weights: a weights file, or the name of a built-in one, instead of labels; the page shows
+            the labels of every method.
+        html: the page to write; default: a temporary page, which opens in the browser.
+        scans: the highest number of scans, which are evenly spaced.
+        taxonomy: the classes of labels that belong to no dataset.
         overwrite: replace the page if it exists.
     """
     from amvnet.data.spacing import evenly_spaced
@@ -60,9 +60,9 @@ def view(
             "leave it out"
         )
     if scans < 1:
-        raise InputError(f"expected a number of scans from 1, found {scans}; say --scans 5")
+        raise InputError(f"expected --scans of 1 or more, found {scans}; give --scans 5")
     sensor = known.parse()
-    # Before any scan is segmented, so that no time is wasted if the page cannot be written.
+    # Check this before any scan is segmented, so that no time is wasted.
     if html is not None:
         check_outputs({html: PAGE}, [*inputs, labels, weights, known.sensor], overwrite)
         make_folder(html.parent)
