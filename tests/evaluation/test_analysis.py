@@ -19,7 +19,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.evaluation import analysis
-from amvnet.evaluation.analysis import BINS, SWEPT, Analysis, analyze
+from amvnet.evaluation.analysis import BINS, SWEPT_BINS, Analysis, analyze
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.timing import run_once
@@ -105,7 +105,7 @@ def column(path: Path, name: str) -> list[str]:
 # ---- counts
 
 
-@pytest.mark.parametrize("tau", [0.0, 0.31, 0.85, SWEPT / BINS])
+@pytest.mark.parametrize("tau", [0.0, 0.31, 0.85, SWEPT_BINS / BINS])
 def test_a_swept_tau_gives_what_weights_with_that_tau_give(
     dataset: Dataset, weights: Weights, tau: float
 ) -> None:
@@ -145,7 +145,7 @@ def test_points_that_no_network_sees_count_as_evaluate_counts_them(
 def test_a_tau_above_those_that_are_swept_is_analyzed(
     dataset: Dataset, weights: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(analysis, "SWEPT", 50)
+    monkeypatch.setattr(analysis, "SWEPT_BINS", 50)
     weights = with_tau(weights, 0.8)
     analyzed = analyze_08(dataset, weights)
     evaluation = analyzed.evaluation

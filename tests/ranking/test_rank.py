@@ -19,7 +19,13 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking.clusters import CELL, cluster
-from amvnet.ranking.label_errors import NEAR, PointDoubts, find_clusters, measure_doubts, rank
+from amvnet.ranking.label_errors import (
+    VEHICLE_RADIUS,
+    PointDoubts,
+    find_clusters,
+    measure_doubts,
+    rank,
+)
 from amvnet.weights.file import save
 
 from fixtures.commands import files, run_cli
@@ -139,7 +145,7 @@ def test_a_doubt_is_the_agreed_class_in_the_less_certain_view_over_the_label_in_
     for index, label in enumerate(labels):
         agreed = np.argmax(f[index] * g[index])
         expected = 0.0
-        if label > 0 and np.hypot(points[index, 0], points[index, 1]) >= NEAR:
+        if label > 0 and np.hypot(points[index, 0], points[index, 1]) >= VEHICLE_RADIUS:
             of_label = max(f[index, label - 1], g[index, label - 1])
             expected = max(min(f[index, agreed], g[index, agreed]) - of_label, 0)
         assert doubts.doubt[index] == pytest.approx(expected, abs=1e-5)

@@ -1,4 +1,4 @@
-"""The paper's further analysis (section 4.4): agreement, mIoU by distance, sweep of tau."""
+"""Analyse weights as the paper's section 4.4 does: agreement, mIoU by distance, sweep of tau."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan
 
 BINS = 100  # number of equal bins of the cosine similarity, which lies in [0, 1]
-SWEPT = 98  # number of bins that the head classifies at the largest tau, 0.98
+SWEPT_BINS = 98  # number of bins that the head classifies at the largest tau, 0.98
 
-# AMVNet's figures for one value of a parameter: the value; the share of uncertain points, the mIoU
-# and the accuracy, in percent.
+# AMVNet's figures for one value of a parameter: the value; and the share of uncertain points, the
+# mIoU and the accuracy, each in percent.
 SweptRow = tuple[float, float, float, float]
 
 
@@ -38,9 +38,9 @@ class Analysis:
         evaluation: the evaluation of every method that the weights have, including the three
             ensembles.
         tau: the threshold of the weights.
-        points: (BINS,) numbers of points by similarity, labelled or not.
+        points: (BINS,) number of points by similarity, labelled or not.
         ensemble: (BINS, K + 1, K + 1) confusion matrices of the geometric mean, by similarity.
-        head: (SWEPT, K + 1, K + 1) confusion matrices of the point head, by similarity.
+        head: (SWEPT_BINS, K + 1, K + 1) confusion matrices of the point head, by similarity.
     """
 
     evaluation: Evaluation
@@ -59,7 +59,7 @@ class Analysis:
     def sweep(self) -> list[SweptRow]:
         """Return AMVNet's figures for each tau from 0 to 0.98. The head is not trained again."""
         sweep = []
-        for bins in range(SWEPT + 1):
+        for bins in range(SWEPT_BINS + 1):
             matrix = self.head[:bins].sum(axis=0) + self.ensemble[bins:].sum(axis=0)
             share = float(self.points[:bins].sum() / max(self.points.sum(), 1))
             sweep.append(swept_row(bins / BINS, share, matrix, self.evaluation.taxonomy))
@@ -67,7 +67,14 @@ class Analysis:
 
 
 def swept_row(value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxonomy) -> SweptRow:
-    """Return the row of one value, given the share of uncertain points and a confusion matrix."""
+    """Return the row of one value of a parameter.
+
+    Args:
+        value: the value.
+        uncertain: share of uncertain points, in [0, 1].
+        matrix: (K + 1, K + 1) confusion matrix of AMVNet.
+        taxonomy: the classes.
+    """
     figures = metrics(matrix, taxonomy)
     return value, 100 * uncertain, 100 * (figures["miou"] or 0), 100 * (figures["accuracy"] or 0)
 
@@ -80,14 +87,19 @@ def analyze(
 ) -> Analysis:
     """Score labelled scans by every method, and by the head on all points that some tau selects.
 
+    Args:
+        dataset: the dataset that reads the scans.
+        records: the scans.
+        segmenter: segments the scans; its method is "amvnet".
+        progress: called with the number of scans that are done, and their total.
+
     Raises:
-        InputError: if the weights lack a part, or a scan has no ground truth.
+        InputError: if the weights lack a part, or a scan has no true labels.
     """
     assertion = segmenter.model.assertion
     if segmenter.method != "amvnet" or not isinstance(assertion, Disagreement):
         raise InputError(
-            "expected weights with both networks, a head and the disagreement assertion; "
-            "train these"
+            "expected weights with both networks and a head, found others; train the missing parts"
         )
 
     size = dataset.taxonomy.size + 1
@@ -96,7 +108,7 @@ def analyze(
         assertion.tau,
         points=np.zeros(BINS, dtype=np.int64),
         ensemble=np.zeros((BINS, size, size), dtype=np.int64),
-        head=np.zeros((SWEPT, size, size), dtype=np.int64),
+        head=np.zeros((SWEPT_BINS, size, size), dtype=np.int64),
     )
 
     def analyze_one(record: ScanRecord, scan: Scan) -> Analysis:
@@ -117,7 +129,7 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
     assert f is not None
     assert g is not None
 
-    # Compute every method's labels, and the head's labels of all points that some tau selects.
+    # Compute the labels of every method.
     ids = {"rv": expand_labels(f, scan.valid), "bev": expand_labels(g, scan.valid)}
     for name, method in METHODS.items():
         if method.ensemble is not None:
@@ -125,7 +137,8 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
     ids["amvnet"] = expand_labels(scores.merged, scan.valid)
     uncertain = expand_to_scan(scores.uncertain, scan.valid)
 
-    more = (_bins(f, g) < SWEPT) & ~scores.uncertain
+    # Compute the head's labels of all points that some tau selects.
+    more = (_bins(f, g) < SWEPT_BINS) & ~scores.uncertain
     h = segmenter.model.refine(batch, f, g, more)
     assert h is not None
     head = expand_labels(replace_uncertain(scores.merged, more, h), scan.valid)
@@ -143,12 +156,12 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
         assertion.tau,
         points=np.bincount(bins, minlength=BINS),
         ensemble=_confusions(bins, truth, ids["ensemble"], size),
-        head=_confusions(bins, truth, head, size)[:SWEPT],
+        head=_confusions(bins, truth, head, size)[:SWEPT_BINS],
     )
 
 
 def _bins(f: Tensor, g: Tensor) -> Tensor:
-    """Return the bins (P,) of the similarities. Bin b holds similarities in (b, b + 1] / BINS."""
+    """Return the (P,) bin of each point's similarity. Bin b holds (b / BINS, (b + 1) / BINS]."""
     return (cosine_similarity(f, g) * BINS).ceil().long().clamp(1, BINS) - 1
 
 

@@ -17,10 +17,10 @@ from amvnet.files import atomic_write
 from amvnet.models.methods import title_of
 from amvnet.outputs import Signature
 
-SIZE = (6.0, 3.6)  # inches
+SIZE = (6.0, 3.6)  # width and height of a figure, inches
 DOTS_PER_INCH = 160
-MOST_MARKED = 20  # longer sweeps are drawn without markers, which would overlap
-Cell = str | float | int | None  # a cell of a table; None if there is no such number
+MOST_MARKED = 20  # longest sweep that is drawn with markers; in longer ones, they would overlap
+Cell = str | float | int | None  # a cell of a table, or None for an empty cell
 
 
 # Matplotlib's styles for the methods' curves.
@@ -33,12 +33,18 @@ STYLES = {
 
 
 TABLE = Signature("a table of analyze", rb"[^\n]*%")
-FIGURES = ("similarity", "distance", "tau")  # of `write_all`, each with a table
-TABLES = ("classes", "methods")  # of `write_all`, without a figure
+FIGURES = ("similarity", "distance", "tau")  # the figures of `write_all`; each has a table
+TABLES = ("classes", "methods")  # the tables of `write_all` that have no figure
 
 
 def files_of(out: Path, figures: Sequence[str], tables: Sequence[str]) -> dict[Path, Signature]:
-    """Return the files of figures, each with a table, and of tables alone in a folder."""
+    """Return the files of some figures, their tables, and some other tables in a folder.
+
+    Args:
+        out: the folder.
+        figures: names of figures.
+        tables: names of tables without a figure.
+    """
     files = {out / f"{name}.csv": TABLE for name in (*figures, *tables)}
     return files | {out / f"{name}.png": PICTURE for name in figures}
 
@@ -57,10 +63,13 @@ def write_all(analysis: Analysis, dataset: str, out: Path) -> list[Path]:
 def write_sweep(
     rows: Sequence[SweptRow], name: str, used: float, dataset: str, path: Path
 ) -> list[Path]:
-    """Write Figure 8 of the paper, mIoU and share of uncertain points; return the files.
+    """Write Figure 8 of the paper: mIoU and share of uncertain points; return the files.
 
     Args:
-        used: the parameter's value in the weights.
+        rows: the figures for each value of the parameter.
+        name: the name of the parameter.
+        used: the value of the parameter in the weights.
+        dataset: the name of the dataset, for the title.
         path: the path of the files to write, without an ending.
     """
     values, shares, mious, _ = zip(*rows, strict=True)
@@ -107,7 +116,7 @@ def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path
         rows.append((low, high, int(count), 100 * float(count / total)))
 
     figure, axes = _figure(f"agreement of the two networks on {dataset}")
-    # A logarithmic axis has no 0: empty bins are drawn as half a point.
+    # Empty bins are drawn as half a point, because a logarithmic axis has no 0.
     axes.stairs(np.maximum(analysis.points, 0.5), edges, fill=True, color="0.55")
     label = f"tau = {analysis.tau:g}"
     axes.axvline(analysis.tau, color="black", linewidth=0.8, linestyle=":", label=label)

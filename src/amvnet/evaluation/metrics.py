@@ -1,4 +1,4 @@
-"""Confusion matrices, and the official formulas of both benchmarks applied to them."""
+"""Count confusion matrices, and apply the official formulas of both benchmarks to them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REPORT = Signature("figures of evaluate", rb'\{\s*"dataset": ')
 # Edges of the bins in SemanticKITTI's evaluation by distance, metres.
 EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
 
-# Titles of the figures over all classes, in the order of tables.
+# Titles of the figures over all classes, in the order of the rows of tables.
 OVERALL = {
     "miou": "mIoU",
     "miou_present": "mIoU, classes present",
@@ -30,14 +30,15 @@ def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarra
     """Count how often each true class was predicted as each class.
 
     Args:
-        truth, prediction: (N,) train ids in 0..K.
+        truth: (N,) true train ids, 0..K.
+        prediction: (N,) predicted train ids, 0..K.
         size: K, the number of classes.
 
     Returns:
-        (K + 1, K + 1) int64; the row is the true id, the column the predicted one.
+        (K + 1, K + 1) int64. The row is the true id, the column the predicted id.
 
     Raises:
-        InputError: if the two differ in length or an id is outside 0..K.
+        InputError: if the arrays differ in length, or an id is outside 0..K.
     """
     truth = np.asarray(truth)
     prediction = np.asarray(prediction)
@@ -75,9 +76,9 @@ def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
             nor predicted counts in the mIoU, with an IoU of 0.
 
     Returns:
-        Fractions, each None if no point counts: "miou" (official), "miou_present" (the mIoU over
-        the classes in the truth), "accuracy", "fwiou" (the IoU weighted by the frequency in the
-        truth); and "iou", a dictionary of each class's IoU by name.
+        Figures in [0, 1], or None where no point counts: "miou" (official), "miou_present" (the
+        mIoU over the classes in the truth), "accuracy" and "fwiou" (the IoU weighted by the
+        frequency in the truth). "iou" is a dictionary with the IoU of each class by its name.
     """
     labelled = matrix[1:].astype(np.float64)  # (K, K + 1)
     correct = np.diagonal(labelled[:, 1:])
@@ -112,9 +113,9 @@ class Evaluation:
 
     Attributes:
         taxonomy: the classes.
-        matrices: (bins + 1, K + 1, K + 1) counts by method. The first matrix counts all points, the
-            others the points between two `EDGES`. Points exactly on an edge are in no bin, as in
-            SemanticKITTI's tool.
+        matrices: (bins + 1, K + 1, K + 1) counts by method. The first matrix counts all points.
+            Each of the others counts the points between two `EDGES`. Points exactly on an edge are
+            in no bin, as in SemanticKITTI's tool.
         scans: number of scans that were added.
         points: number of points in these scans, labelled or not.
         uncertain: number of uncertain points.
@@ -144,7 +145,7 @@ class Evaluation:
             uncertain: (N,) bool, or None if it is not known which points are uncertain.
 
         Raises:
-            InputError: if `confusion` raises it; the scan is then not counted at all.
+            InputError: if the ids do not fit (`confusion`). The scan is then not counted at all.
         """
         size = self.taxonomy.size
         distances = np.linalg.norm(points[:, :3], axis=1)
@@ -165,7 +166,7 @@ class Evaluation:
             self.asked += len(uncertain)
 
     def __add__(self, other: Evaluation) -> Evaluation:
-        """Return the evaluation of the scans of both; both must have the same classes."""
+        """Return the evaluation of the scans of both evaluations, which must have equal classes."""
         total = Evaluation(self.taxonomy)
         for part in (self, other):
             total._add_counts(part.matrices)
@@ -176,7 +177,11 @@ class Evaluation:
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
-        """Return all metrics of a dataset, over all points and by distance, for JSON."""
+        """Return all metrics, over all points and by distance, as a dictionary for JSON.
+
+        Args:
+            dataset: the name of the dataset.
+        """
         methods = {}
         for method, matrices in self.matrices.items():
             bins = []

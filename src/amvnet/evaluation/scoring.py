@@ -32,10 +32,11 @@ from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan, check_scan
 
 Result = TypeVar("Result")
-# Train ids (N,) by method; and (N,) bool, the uncertain points, or None without two networks.
+# The train ids (N,) by method; and (N,) bool, the uncertain points, or None if there are not two
+# networks.
 MethodLabels = tuple[dict[str, np.ndarray], np.ndarray | None]
 
-PICTURES = 4  # number of scans that are drawn, evenly spaced
+MOST_PICTURES = 4  # most scans that are drawn; they are evenly spaced
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,11 @@ class Labeller:
     """Labels scans.
 
     Attributes:
-        label: labels a scan by one or several methods.
+        label: a function that labels a scan by one or several methods.
         taxonomy: the classes of the labels.
-        classes: maps the labels' classes and the data's classes to the classes that are scored;
-            None if all these are the same.
-        at_once: number of scans that it labels at the same time, each in a thread.
+        classes: a map from the classes of the labels, and from the classes of the data, to the
+            classes that are scored; None if all three are the same.
+        at_once: number of scans that `label` may take at the same time, each in a thread.
     """
 
     label: Callable[[ScanRecord, Scan], MethodLabels]
@@ -56,7 +57,7 @@ class Labeller:
     at_once: int = 1
 
     def table(self, taxonomy: Taxonomy) -> np.ndarray:
-        """Return the train ids to score, (K + 1,) uint8, indexed by a taxonomy's train ids."""
+        """Return the (K + 1,) uint8 train ids that are scored, by the K + 1 ids of a taxonomy."""
         if self.classes is None:
             return np.arange(taxonomy.size + 1, dtype=np.uint8)
         return self.classes.table(taxonomy)
@@ -73,9 +74,12 @@ def evaluate(
     """Score the labels of some scans.
 
     Args:
-        pictures: folder for pictures of a few scans from above; by default none are drawn.
+        dataset: the dataset that reads the scans.
+        records: the scans.
+        labeller: labels the scans.
+        pictures: folder for pictures of a few scans from above. By default, none are drawn.
         progress: called with the number of this process's scans that are done, and their total.
-        processes: the processes that share the scans; each returns the evaluation of all scans.
+        processes: the processes that share the scans. Each returns the evaluation of all scans.
 
     Raises:
         InputError: if the labels do not have the dataset's classes, or a scan has no true labels.
@@ -110,13 +114,13 @@ def evaluate(
 
 
 def pictures_of(records: Sequence[ScanRecord], folder: Path) -> dict[Path, Signature]:
-    """Return the pictures that `evaluate` draws of some scans into a folder."""
+    """Return the pictures that `evaluate` draws of some scans into a folder, by their paths."""
     return {_picture_of(record, folder): PICTURE for record in _pictured(records)}
 
 
 def _pictured(records: Sequence[ScanRecord]) -> Sequence[ScanRecord]:
     """Return the scans that are drawn."""
-    return evenly_spaced(records, PICTURES)
+    return evenly_spaced(records, MOST_PICTURES)
 
 
 def _picture_of(record: ScanRecord, folder: Path) -> Path:
@@ -130,7 +134,11 @@ def stream_labelled(
     at_once: int,
     progress: Progress,
 ) -> Iterator[Result]:
-    """Yield results as `stream_scans` does; raise InputError if a scan has no true labels."""
+    """Yield results as `stream_scans` does.
+
+    Raises:
+        InputError: if a scan cannot be read, or has no true labels.
+    """
 
     def read(record: ScanRecord) -> Scan:
         scan = dataset.read(record)
@@ -162,8 +170,12 @@ def labels_by_method(
 ) -> MethodLabels:
     """Label the N points of a scan by a segmenter's method and by the methods that it includes.
 
-    AMVNet and the ensembles include all ensembles and each network alone. Other `methods` are left
+    AMVNet and the ensembles include all ensembles and each single network. Other `methods` are left
     out. The networks run only once.
+
+    Returns:
+        (N,) train ids by method; and (N,) bool, the uncertain points, or None if there are not two
+        networks.
     """
     batch = segmenter.batch([scan])
     scores = segmenter.engine.score(batch)
@@ -183,7 +195,7 @@ def labels_by_method(
 
 @torch.inference_mode()
 def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatch) -> Tensor | None:
-    """Return the scores (P, K) by another method; None if the segmenter does not include it."""
+    """Return the scores (P, K) by another method, or None if the segmenter does not include it."""
     f = scores.rv
     g = scores.bev
     ensemble = METHODS[name].ensemble

@@ -16,10 +16,10 @@ from amvnet.data.taxonomy import Color, Taxonomy
 from amvnet.files import atomic_write
 from amvnet.outputs import Signature
 
-REACH = 50.0  # distance shown on each side of the sensor, metres
+REACH = 50.0  # distance that is shown on each side of the sensor, metres
 PANEL = 4.6  # width and height of a panel, inches
 DOTS_PER_INCH = 130
-ENTRIES = 3  # number of legend entries in a line, for each column of panels
+ENTRIES = 3  # number of entries in a line of the legend, for each column of panels
 LEGEND_LINE = 0.2  # height of a line of the legend, inches
 LEGEND_MARGIN = 0.5  # margin of the legend, inches
 DOT = 1.1  # area of a drawn point, square typographic points
@@ -36,7 +36,7 @@ class _Panel:
     Attributes:
         title: the line above the panel.
         colors: (N, 3) RGB in [0, 1].
-        on_top: (N,) bool, the points that are drawn over all others.
+        on_top: (N,) bool, the points that are drawn over all other points.
     """
 
     title: str
@@ -46,7 +46,7 @@ class _Panel:
 
 @dataclass(frozen=True)
 class TopView:
-    """What a drawing of N points from above shows.
+    """The content of a drawing of N points from above.
 
     Attributes:
         points: (N, 3 or more) x, y, z in metres.
@@ -66,11 +66,11 @@ class TopView:
 
 
 def draw_scan(path: Path, view: TopView) -> Path:
-    """Draw one scan from above, x to the right and y up, 50 m to each side; return the path.
+    """Draw one scan from above, x to the right and y up, `REACH` to each side; return the path.
 
-    The first row shows the truth and each prediction. Below each prediction are its errors: correct
-    points in grey, wrong points in red; ignored points are neither. Below the truth are the
-    uncertain points. The legend has the classes that appear. The PNG appears whole or not at all.
+    The first row shows the truth and each prediction. Below each prediction are its errors: wrong
+    points are red, all others grey. Below the truth are the uncertain points. The legend has the
+    classes that appear. The PNG appears whole or not at all.
     """
     from matplotlib.figure import Figure
 

@@ -1,1 +1,1 @@
-"""Rank labels that may be wrong, the most doubtful first."""
+"""Rank labels that may be wrong, the most doubtful labels first."""

@@ -8,17 +8,18 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 CELL = 0.4  # side of a cell, metres; points in the same cell or in touching cells are connected
-# Cells that touch, even if only at a corner, are at most sqrt(3) cells apart; others at least 2.
-TOUCHING = 1.75  # largest distance of touching cells, cells
-APART = 4.0  # least distance of cells of different kinds, cells
+# The indices of cells that touch, even if only at a corner, are at most sqrt(3) apart. The indices
+# of other cells are at least 2 apart.
+TOUCHING = 1.75  # a distance between these two, cells
+APART = 4.0  # least distance between cells of different kinds, cells
 
 
 def cluster(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """Return the cluster of each point, (N,) int64, numbered from 0.
+    """Return the (N,) int64 cluster of each point, numbered from 0.
 
     Args:
-        xyz: (N, 3) metres.
-        kind: (N,) integers; points of different kinds are never in one cluster.
+        xyz: (N, 3) coordinates, metres.
+        kind: (N,) integers. Points of different kinds are never in one cluster.
     """
     if not len(xyz):
         return np.zeros(0, dtype=np.int64)

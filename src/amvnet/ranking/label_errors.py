@@ -26,18 +26,20 @@ from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan, check_scan
 
-NEAR = 1.5  # metres; nearer points belong to the sensor's vehicle and are never doubted
-# A cluster's mean doubt includes this many additional points with doubt 0, so that clusters of a
-# few stray points do not rank first.
-FEW = 20.0
-# A score is divided by the number of clusters of the same kind, raised to this power. If a
-# contradiction occurs often, more likely the views are wrong than the labels.
-COMMON = 0.5
+# The radius of the sensor's vehicle, metres. Nearer points are never doubted.
+VEHICLE_RADIUS = 1.5
+# The number of additional points with doubt 0 in the mean doubt of a cluster. They keep clusters of
+# a few stray points from the first ranks.
+ADDED_POINTS = 20.0
+# The power of the number of clusters of the same kind by which a score is divided. If a
+# contradiction occurs often, the views are more likely to be wrong than the labels.
+COMMON_POWER = 0.5
 
 COLUMNS = ("rank", "scan", "score", "x", "y", "z", "points", "point", "rv", "bev", "label")
 TABLE = Signature("a table of rank", ",".join(COLUMNS).encode())
 
-# One cluster. The middle point of a cluster is the point nearest to the mean of its points.
+# The row of a cluster. The middle point of a cluster is the point nearest to the mean of its
+# points.
 ROW = np.dtype(
     [
         ("scan", np.int32),  # index of the scan among the ranked scans
@@ -55,17 +57,17 @@ ROW = np.dtype(
 
 @dataclass(frozen=True)
 class PointDoubts:
-    """How doubtful each of the N points of a scan is.
+    """How doubtful the label of each of the N points of a scan is.
 
     Attributes:
-        xyz: (N, 3) metres.
-        doubt: (N,) float32 in [0, 1]; 0 for points that are not doubted.
+        xyz: (N, 3) coordinates, metres.
+        doubt: (N,) float32, in [0, 1]; 0 for points that are not doubted.
         rv: (N,) train ids predicted by the range view.
         bev: (N,) train ids predicted by the bird's-eye view.
         label: (N,) train ids of the labels.
-        kind: (N,) one number for the label and the class that both views agree on. All points of a
-            cluster have the same kind.
-        whole: (N,) number of points of the labelled thing to which the point belongs.
+        kind: (N,) a number for the pair of the label and the class that both views agree on. All
+            points of a cluster have the same kind.
+        whole: (N,) number of points in the labelled thing to which the point belongs.
     """
 
     xyz: np.ndarray
@@ -83,7 +85,13 @@ def rank(
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> np.ndarray:
-    """Return the doubtful clusters of some labelled scans, the most doubtful first.
+    """Return the doubtful clusters of some labelled scans, the most doubtful cluster first.
+
+    Args:
+        dataset: the dataset that reads the scans.
+        records: the scans.
+        segmenter: scores the points by both networks.
+        progress: called with the number of scans that are done, and their total.
 
     Returns:
         (C,) rows of `ROW`.
@@ -106,13 +114,17 @@ def rank(
 
     clusters = np.concatenate(rows_by_scan)
     _, kind, counts = np.unique(clusters["kind"], return_inverse=True, return_counts=True)
-    clusters["score"] /= counts[kind] ** COMMON
+    clusters["score"] /= counts[kind] ** COMMON_POWER
     # A stable sort keeps equal scores in the dataset's order, on every machine.
     return clusters[np.argsort(-clusters["score"], kind="stable")]
 
 
 def measure_doubts(scan: Scan, segmenter: Segmenter) -> PointDoubts:
-    """Return how doubtful each label of a scan is; raise InputError if it has no labels."""
+    """Return how doubtful each label of a scan is.
+
+    Raises:
+        InputError: if the scan has no labels.
+    """
     label = scan.labels
     if label is None:
         raise InputError(
@@ -130,7 +142,7 @@ def measure_doubts(scan: Scan, segmenter: Segmenter) -> PointDoubts:
 
     xyz = scan.points[:, :3]
     distance = np.hypot(xyz[valid, 0], xyz[valid, 1])
-    off_vehicle = torch.from_numpy(distance >= NEAR)  # (P,)
+    off_vehicle = torch.from_numpy(distance >= VEHICLE_RADIUS)  # (P,)
 
     contradiction, agreed_ids = _contradiction(f, g, torch.from_numpy(label[valid]))
     doubt = expand_to_scan(contradiction * off_vehicle, valid)
@@ -143,11 +155,11 @@ def measure_doubts(scan: Scan, segmenter: Segmenter) -> PointDoubts:
 def _contradiction(
     f: torch.Tensor, g: torch.Tensor, label: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return how strongly both views contradict the labels, and the class they agree on.
+    """Return how strongly both views contradict the labels, and the class that they agree on.
 
-    Each view gives a probability to the class that both agree on, and one to the label. The
-    contradiction is the smaller probability of the former minus the larger probability of the
-    latter. It is 0 if this difference is negative or the point has no label.
+    Each view gives a probability to the class that both agree on, and a probability to the label.
+    The contradiction is the smaller probability of the class minus the larger probability of the
+    label. It is 0 if this difference is negative, or if the point has no label.
 
     Args:
         f: (P, K) class probabilities of the range view.
@@ -167,10 +179,10 @@ def _contradiction(
 
 
 def _thing_sizes(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the number of points in the thing of each point, (N,).
+    """Return the (N,) number of points in the thing to which each point belongs.
 
-    A thing is a set of connected points with one label. A point that is not valid is a thing of its
-    own.
+    A thing is a set of connected points with one label. Each point that is not valid is a thing of
+    its own.
     """
     things = cluster(xyz[valid], label[valid])
     sizes = np.ones(len(xyz))
@@ -179,7 +191,7 @@ def _thing_sizes(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.nd
 
 
 def find_clusters(doubts: PointDoubts) -> np.ndarray:
-    """Divide the doubted points of one scan into clusters: (C,) rows of `ROW`."""
+    """Divide the doubted points of one scan into clusters, and return the (C,) rows of `ROW`."""
     doubted = np.flatnonzero(doubts.doubt > 0)
     group = cluster(doubts.xyz[doubted], doubts.kind[doubted])
     sizes = np.bincount(group)
@@ -189,7 +201,7 @@ def find_clusters(doubts: PointDoubts) -> np.ndarray:
     share = sizes / doubts.whole[middle]
 
     rows = np.zeros(len(sizes), dtype=ROW)
-    rows["score"] = share * total_doubt / (sizes + FEW)
+    rows["score"] = share * total_doubt / (sizes + ADDED_POINTS)
     rows["xyz"] = doubts.xyz[middle]
     rows["points"] = sizes
     rows["point"] = middle
@@ -203,7 +215,7 @@ def find_clusters(doubts: PointDoubts) -> np.ndarray:
 def _middle_points(
     xyz: NDArray[np.floating], group: NDArray[np.intp], sizes: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """Return the index of the point nearest to the mean in each group."""
+    """Return for each group the index of the point nearest to the mean."""
     mean = np.stack([np.bincount(group, axis) / sizes for axis in xyz.T], axis=1)
     squared_distance = ((xyz - mean[group]) ** 2).sum(axis=1)
     order = np.lexsort((squared_distance, group))
@@ -214,7 +226,7 @@ def _middle_points(
 
 
 def _most_common(ids: NDArray[np.integer], group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return the most common id in each of `count` groups; the lowest if several are."""
+    """Return the most common id in each of `count` groups; among equals, the lowest id."""
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
     most_common: NDArray[np.intp] = table.argmax(axis=1)
@@ -224,7 +236,14 @@ def _most_common(ids: NDArray[np.integer], group: NDArray[np.intp], count: int) 
 def write_clusters(
     clusters: np.ndarray, records: Sequence[ScanRecord], taxonomy: Taxonomy, path: Path
 ) -> None:
-    """Write clusters to a CSV file, with their ranks as the first column."""
+    """Write clusters to a CSV file with their ranks in the first column.
+
+    Args:
+        clusters: (C,) rows of `ROW`, sorted.
+        records: the ranked scans.
+        taxonomy: the classes.
+        path: the file, which appears whole or not at all.
+    """
     names = ("", *taxonomy.classes)
     with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -1,1 +1,1 @@
-"""The memory, the threads and the processes of a run."""
+"""Control the memory, the threads and the processes of a run."""

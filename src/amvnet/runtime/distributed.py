@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# How long a process waits for the others. A process may read for hours. If one dies, all end.
+# The longest time that a process waits for the others. A process may read for hours. If one process
+# dies, all end.
 LONGEST_WAIT = timedelta(days=7)
 
 
@@ -34,7 +35,8 @@ class Processes:
         size: number of processes.
         local_rank: this process's number among the processes on its machine, from 0.
         nodes: number of machines.
-        group: torch's process group for exchanging Python objects; None for a single process.
+        group: torch's process group for the exchange of Python objects; None if there is only one
+            process.
     """
 
     rank: int = 0
@@ -56,7 +58,7 @@ class Processes:
         """Return the values of all processes, by rank. Every process must call this.
 
         Raises:
-            ConnectionError: if another process has ended.
+            ConnectionResetError: if another process has ended.
         """
         if self.size == 1:
             return [value]
@@ -65,7 +67,7 @@ class Processes:
         try:
             dist.all_gather_object(values, value, group=self.group)
         except RuntimeError as error:
-            reason = "another process ended before its work was done, for the reason that it gave"
+            reason = "another process ended before its work was done, and has printed the reason"
             raise ConnectionResetError(errno.ECONNRESET, reason, "torch.distributed") from error
         return values
 
@@ -103,7 +105,7 @@ def environment() -> ClusterEnvironment:
 
 
 def started() -> int:
-    """Return how many processes were started for this job, as the environment variables say."""
+    """Return the number of processes that were started for this job, by environment variables."""
     if dist.is_torchelastic_launched():
         return int(os.environ.get("WORLD_SIZE", "1"))
 
@@ -111,7 +113,7 @@ def started() -> int:
 
 
 def _slurm_tasks() -> int:
-    """Return the number of tasks that srun has started; 1 in the job's own script."""
+    """Return the number of tasks that srun has started. In the job's own script, it is 1."""
     if "SLURM_STEP_ID" not in os.environ:
         return 1
 
@@ -123,8 +125,8 @@ def join(cuda: bool = False) -> Processes:
     """Connect to the other processes of this job, if there are any.
 
     Args:
-        cuda: whether the processes compute on CUDA devices and exchange gradients by NCCL instead
-            of gloo.
+        cuda: whether the processes compute on CUDA devices. They then exchange gradients by NCCL
+            instead of gloo.
     """
     if started() == 1:
         return ALONE

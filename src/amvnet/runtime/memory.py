@@ -1,4 +1,4 @@
-"""Keep this process's memory from one scan to the next, and measure how much there is."""
+"""Keep the memory of this process from one scan to the next, and measure memory."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 # Options of glibc's mallopt, from malloc.h.
-M_TRIM_THRESHOLD = -1  # number of free bytes above which they are returned to the system
-M_MMAP_MAX = -4  # most blocks that have a mapping of their own
-M_ARENA_MAX = -8  # most heaps of the process
+M_TRIM_THRESHOLD = -1  # free memory above which memory is returned to the system, bytes
+M_MMAP_MAX = -4  # highest number of blocks that have a mapping of their own
+M_ARENA_MAX = -8  # highest number of heaps
 DEFAULTS = {M_MMAP_MAX: 65536, M_TRIM_THRESHOLD: 128 * 1024}  # glibc's default values
 
 MEMINFO = Path("/proc/meminfo")
@@ -72,8 +72,8 @@ def _set_options(options: Mapping[int, int]) -> bool:
 def available_memory() -> int:
     """Return how much memory this process can still take, in bytes.
 
-    This is what the machine has available, or less if the control group allows less. On systems
-    other than Linux, it is taken to be half of the machine's memory.
+    This is the memory that the machine has available, or less if the control group allows less. On
+    systems other than Linux, half of the machine's memory is assumed.
     """
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     available = total // 2

@@ -1,8 +1,9 @@
-"""Make this process's OpenMP threads behave while other programs run, and after a fork.
+"""Keep OpenMP threads fast while other programs run, and safe after a fork.
 
 torch divides each operation among a team of OpenMP threads. A thread that is done waits for the
-others. By default it spins: it keeps its processor busy. If other programs also run, the thread for
-which all wait may find no free processor, and a call takes many times as long.
+others. By default, it spins, which means that it keeps its processor busy. If other programs run
+as well, the last thread of the team may find no free processor. A call then takes many times as
+long.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
-# With these variables, threads sleep while they wait. GNU's and LLVM's OpenMP read the first,
-# LLVM's and Intel's the last. For GNU's, the second would override the first, so it stays unset.
+# Environment variables that let threads sleep while they wait. The OpenMP of GNU and of LLVM reads
+# the first, the OpenMP of LLVM and of Intel the last. For GNU, the second would override the first,
+# so it stays unset.
 WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": None, "KMP_BLOCKTIME": "0"}
 
 Part = TypeVar("Part")
@@ -46,11 +48,15 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     """Run the parts of a computation on a CPU; return their results in order.
 
     torch wakes sleeping threads for their share of each operation. If operations are short, waking
-    takes longer than the share. So every thread takes whole parts instead. If there are fewer parts
-    than threads, each part gets equally many threads.
+    a thread takes longer than its share. Therefore every thread takes whole parts instead. If there
+    are fewer parts than threads, each part gets the same number of threads.
 
-    If threads spin, they need no waking, and would keep the processors from the threads that run
-    the parts. Then the parts run in turn.
+    Spinning threads need no waking, and would keep the processors from the threads that run the
+    parts. If threads spin, the parts run one after the other.
+
+    Args:
+        run: computes a part.
+        parts: the arguments of `run`.
     """
     import torch
 
@@ -60,7 +66,7 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     if workers < 2:
         return [run(part) for part in parts]
 
-    # Each thread has its own value of these settings, so they are passed on.
+    # Pass these settings on, because each thread has its own values of them.
     is_inference = torch.is_inference_mode_enabled()
     is_mixed = torch.is_autocast_enabled("cpu")
     precision = torch.get_autocast_dtype("cpu")
@@ -79,7 +85,7 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
 
 @contextmanager
 def thread_pool(workers: int, threads_each: int) -> Iterator[ThreadPoolExecutor]:
-    """Yield a pool of threads; each computes with `threads_each` of torch's threads."""
+    """Yield a pool of threads. Each computes with `threads_each` of torch's threads."""
     import torch
 
     threads = torch.get_num_threads()
@@ -89,7 +95,7 @@ def thread_pool(workers: int, threads_each: int) -> Iterator[ThreadPoolExecutor]
         ) as pool:
             yield pool
     finally:
-        torch.set_num_threads(threads)  # the pool's threads changed it for the whole process
+        torch.set_num_threads(threads)  # which the pool changed for the whole process
 
 
 @cache  # once per process

@@ -15,10 +15,11 @@ from amvnet.progress import Progress, no_progress
 from amvnet.submission.rules import LIDAR_ALONE, Rules
 
 ENDING = ".zip"
-LEVEL = 6  # level of deflate; level 9 takes five to eight times as long and saves a sixth
-# Every entry has this time, so that the same content gives the same bytes.
+# The compression level of deflate. Level 9 takes five to eight times as long, and saves a sixth.
+LEVEL = 6
+# The time of every entry. It is fixed, so that the same content gives the same bytes.
 LONG_AGO = (1980, 1, 1, 0, 0, 0)
-# The first entry is a folder.
+# Archives begin with the entry of a folder.
 ARCHIVE = Signature("an archive of submit", rb"PK\x03\x04.{26}(sequences|lidarseg)/PK")
 UNIX = 3  # ZIP's code for entries that Unix wrote
 FOLDER_BIT = 0x10  # the bit of an entry's MS-DOS attributes that marks a folder
@@ -33,14 +34,17 @@ def write(
 ) -> int:
     """Check the predictions in a folder and pack them; return their number.
 
-    The same predictions give the same bytes. Files that do not belong in the archive (scores, other
-    splits) are left out. Only one scan at a time is in memory.
+    The same predictions give the same bytes. Files that do not belong in the archive, such as
+    scores or other splits, are left out. Only one scan at a time is in memory.
 
     Args:
+        rules: the rules of the benchmark's server.
         folder: folder with the predictions, under the file names of `rules`.
-        out: NAME.zip; it appears whole or not at all.
-        use_external: whether the method also learnt from other data; used if the benchmark asks.
-        progress: called before each file and at the end.
+        out: the archive, NAME.zip. It appears whole or not at all.
+        use_external: whether the method also learnt from data outside the benchmark. Only archives
+            for nuScenes state it.
+        progress: called before each file and at the end, with the number of files that are done and
+            their total.
 
     Raises:
         InputError: if a prediction is missing or breaks the rules, or the archive cannot be

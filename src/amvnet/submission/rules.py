@@ -1,6 +1,6 @@
-"""What each benchmark's server expects in an archive: the files, their sizes and their ids.
+"""State what each benchmark's server expects in an archive: the files, their sizes and their ids.
 
-The official checkers have these rules: `validate_submission.py` (task "segmentation") and
+These are the rules of the official checkers: `validate_submission.py` (task "segmentation") and
 `evaluate_semantics.py` of PRBonn/semantic-kitti-api, and
 `python-sdk/nuscenes/eval/lidarseg/validate_submission.py` of nutonomy/nuscenes-devkit.
 """
@@ -20,9 +20,11 @@ from amvnet.data.labels.ids import train_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
-TEST_SCANS = 20_351  # test scans of SemanticKITTI (KITTI odometry 11 to 21); the server wants all
+# The number of test scans of SemanticKITTI (KITTI odometry 11 to 21). The server expects all of
+# them.
+TEST_SCANS = 20_351
 
-# nuScenes' submission.json declares what a method uses.
+# What a method uses, as submission.json of nuScenes declares it.
 LIDAR_ALONE = {
     "use_camera": False,
     "use_lidar": True,
@@ -38,12 +40,13 @@ class Rules:
 
     Attributes:
         taxonomy: the classes.
-        points: for each required prediction, its number of points by its name.
-        dtype: number type of the ids.
+        points: the number of points of each required prediction, by the name of its file.
+        dtype: the number type of the ids.
         unlabelled: whether points may have no class (train id 0).
         folders: names of the entries for folders, outer folders first, each with a trailing slash.
-        meta: name of submission.json, which says what the method uses; None if there is none.
-        official: the number of predictions that the server expects; None if it does not matter.
+        meta: name of submission.json, which declares what the method uses; None if the benchmark
+            asks for no such file.
+        official: the number of predictions that the server expects; None if any number will do.
     """
 
     taxonomy: Taxonomy
@@ -92,8 +95,8 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
 
     The official validator requires a name that ends in .zip, an entry for every folder, a file for
     every scan in the `velodyne` folders, and 4 bytes per point. It does not check the ids. The
-    server's evaluation reads unknown ids as "unlabeled", and stops at ids above 358; here, unknown
-    ids are errors. A point may be unlabelled; it then counts as missed. The upper 16 bits of an id
+    server's evaluation reads unknown ids as "unlabeled", and stops at ids above 358. Here, unknown
+    ids are errors. A point may be unlabelled, but then counts as missed. The upper 16 bits of an id
     are free.
     """
     wanted = dataset.taxonomy.splits[split] if sequences is None else sorted(set(sequences))
@@ -127,7 +130,7 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
         raise InputError(
             f"{dataset.root}: expected scenes of the {split} split, "
             f"found none in {dataset.version}; give the data of that split, "
-            "or name another one with --split"
+            "or name another split with --split"
         )
 
     records = dataset.records(scenes)
