@@ -2,11 +2,11 @@
 
     python docs/perspective.py pandaset/scans/001_00.bin pandaset/labels/001_00.npy [--out FILE.png]
 
-The scan is from PandaSet by Hesai and Scale AI (CC BY 4.0), as rows of float32: x forward, y left
-and z up in metres, and intensity in [0, 1]; the labels are PandaSet's ids, one a point. Four
-panels: official labels, AMVNet's labels, the uncertain points, and the wrong labels. Points are
-drawn as discs whose size follows their distance, the nearest on top, at twice the resolution of
-the picture.
+The scan is from PandaSet by Hesai and Scale AI (CC BY 4.0). It has rows of float32: x forward, y
+left and z up in metres, and intensity in [0, 1]. The labels are PandaSet's ids, one for each point.
+The picture has four panels: official labels, AMVNet's labels, the uncertain points, and the wrong
+labels. Points are drawn as discs whose size follows their distance, the nearest on top, at twice
+the resolution of the picture.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ from PIL import Image, ImageDraw, ImageFont
 import amvnet
 from amvnet.data import palette
 
-PANEL = (1000, 560)  # pixels, width and height
-GAP = 8  # pixels between panels
-OVERSAMPLE = 2
-LEGEND = 56  # pixels, height of a row
-MOST_COLUMNS = 10  # of the legend
-LEAST = 120  # points of a class in the legend, of both upper panels
+PANEL = (1000, 560)  # the width and height of a panel, pixels
+GAP = 8  # the distance between panels, pixels
+OVERSAMPLE = 2  # the resolution of the drawing, relative to the picture
+LEGEND = 56  # the height of a row of the legend, pixels
+MOST_COLUMNS = 10  # the most classes in a row of the legend
+LEAST = 120  # the least number of points of a class in the legend, over both upper panels
 
 BACKGROUND = np.array([13, 16, 22], np.float32)
 INK = (226, 230, 238)
-PLAIN = (74, 82, 96)  # points that a panel says nothing about
+PLAIN = (74, 82, 96)  # the colour of points that a panel does not mark
 
-DISC = 0.004  # radius of a point in metres, per metre from the sensor: it fills the gaps of a wall
-SMALLEST = 0.028  # metres
-FOG = 120.0  # metres at which a colour has lost 63 % of its contrast
-REACH = 75.0  # metres from the sensor
-DARKEST = 105.0  # luminance that class colours are lifted to, for a dark background
+# The radius of a point for each metre from the sensor, metres; discs fill the gaps of a wall.
+DISC = 0.004
+SMALLEST = 0.028  # the least radius of a point, metres
+FOG = 120.0  # the distance at which a colour has lost 63 % of its contrast, metres
+REACH = 75.0  # the largest distance of points that are drawn, metres
+DARKEST = 105.0  # the least luminance of class colours, which stand on a dark background
 
 
-# The classes of the weights that PandaSet's ids stand for; points of other ids, such as poles, are
-# not compared.
+# The classes of the weights, by PandaSet's ids. Points of other ids, such as poles, are not
+# compared.
 OFFICIAL = {
     5: "vegetation",
     6: "terrain",  # "Ground"
@@ -56,7 +57,7 @@ OFFICIAL = {
     36: "traffic-sign", 38: "traffic-sign",
     41: "building",
 }  # fmt: skip
-# Classes of the weights that PandaSet does not tell from another one.
+# Classes of the weights that PandaSet does not tell from another class.
 MERGED = {"parking": "road", "trunk": "vegetation"}
 
 

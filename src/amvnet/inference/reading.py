@@ -124,7 +124,8 @@ def expectation_of(weights: Weights) -> Expectation:
 def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
     """Return a dataset whose scans are normalised as scan files are.
 
-    Only a user's own scans are: the scans of the benchmarks are as weights expect them.
+    Only a user's own scans are changed: the scans of the benchmarks stay unchanged, because weights
+    are trained on such scans.
 
     Args:
         normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML

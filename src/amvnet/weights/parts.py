@@ -1,4 +1,4 @@
-"""Weights put together from the parts of others: replaced, of other sizes, classes or depth."""
+"""Change the parts of weights: replace one, or change its sizes, classes or depth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from amvnet.models.amvnet import build_amvnet
 from amvnet.models.layers import ResidualBlock
 from amvnet.weights.file import Weights
 
-# Fields of `ModelConfig` that set the sizes of each part.
+# The fields of `ModelConfig` that set the sizes of each part.
 SIZES = {
     "range_net": ("range_view", "range_net"),
     "polar_net": ("polar_view", "polar_net"),
@@ -25,7 +25,12 @@ SIZES = {
 
 
 def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
-    """Return weights with one part, its sizes and its records taken from other weights.
+    """Return weights in which one part, its sizes and its records come from other weights.
+
+    Args:
+        weights: the weights that keep their other parts.
+        part: "range_net", "polar_net" or "point_head".
+        other: the weights that have the new part.
 
     Raises:
         InputError: if the other weights lack the part or have other classes.
@@ -38,7 +43,7 @@ def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
     if weights.taxonomy.classes != other.taxonomy.classes:
         raise InputError(
             f"expected weights for the classes of {weights.taxonomy.name}, found weights for "
-            f"{other.taxonomy.name}; train that part on this benchmark"
+            f"{other.taxonomy.name}; train this part on the benchmark"
         )
 
     tensors = {}
@@ -57,9 +62,14 @@ def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
 
 
 def resized(weights: Weights, part: str, model: ModelConfig) -> Weights:
-    """Return weights with the sizes of one part taken from another configuration.
+    """Return weights in which the sizes of one part come from another configuration.
 
-    The parameters stay unchanged: replace them as well before building the model.
+    The parameters stay unchanged: also replace them before you build the model.
+
+    Args:
+        weights: trained weights.
+        part: "range_net", "polar_net" or "point_head".
+        model: the configuration with the new sizes.
     """
     sizes = {key: getattr(model, key) for key in SIZES[part]}
     return dataclasses.replace(weights, model=dataclasses.replace(weights.model, **sizes))
@@ -67,7 +77,7 @@ def resized(weights: Weights, part: str, model: ModelConfig) -> Weights:
 
 def fits(weights: Weights, part: str, model: ModelConfig) -> bool:
     """Return whether the parameters of one part have the sizes of another configuration."""
-    with torch.device("meta"):  # without memory
+    with torch.device("meta"):  # takes no memory
         module = getattr(build_amvnet(model, weights.taxonomy.size), part)
     try:
         module.load_state_dict(weights.part(part), assign=True)
@@ -77,18 +87,20 @@ def fits(weights: Weights, part: str, model: ModelConfig) -> bool:
 
 
 def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weights, list[str]]:
-    """Return weights to begin a training for other classes with.
+    """Return weights with which a training for other classes can begin.
 
     Parameters whose size depends on the number of classes are new: the last layers, and the layers
-    of the head that see the scores. All others are kept.
+    of the head that see the scores. All other parameters are kept.
 
     Args:
-        seed: seed of the new parameters.
+        weights: trained weights.
+        taxonomy: the new classes.
+        seed: the seed of the new parameters.
 
     Returns:
         The weights, without records of a training, and the names of the new parameters.
     """
-    with torch.device("meta"):  # without memory
+    with torch.device("meta"):  # takes no memory
         few = build_amvnet(weights.model, 1).state_dict()
         more = build_amvnet(weights.model, 2).state_dict()
     with torch.random.fork_rng(devices=[]):
@@ -153,6 +165,6 @@ def deepened(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weig
 
 
 def _with_entry(records: Mapping[str, Any], others: Mapping[str, Any], part: str) -> dict[str, Any]:
-    """Return records by part, with the record of one part from others, or without it."""
+    """Return records by part, in which one part has its record of `others`, or no record."""
     kept = {key: record for key, record in records.items() if key != part}
     return kept | ({part: others[part]} if part in others else {})
