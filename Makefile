@@ -4,7 +4,9 @@ BIN := .venv/bin
 # A process for each processor, and one thread in each. The tests of a file share what they make, so one process runs them.
 SPREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow bench gpu docs lint format clean
+.PHONY: install demo test test-slow bench gpu docs lint format release clean
+
+install: .venv/installed  ## the package and all that its tests need, in .venv
 
 demo: .venv/installed  ## simulate streets, segment and score them, and show all in demo/index.html
 	$(BIN)/amvnet demo --out demo --overwrite
@@ -27,12 +29,15 @@ docs: .venv/docs docs/try/node_modules  ## the site of docs/, in site/
 
 lint: .venv/installed
 	$(BIN)/ruff check src ros2 docker tests benchmarks docs .ci
-	$(BIN)/ruff format --check src ros2 docker tests benchmarks docs/*.py
+	$(BIN)/ruff format --check src ros2 docker tests benchmarks docs/*.py .ci
 	$(BIN)/mypy
 
 format: .venv/installed
 	$(BIN)/ruff check --fix src ros2 docker tests benchmarks docs .ci
-	$(BIN)/ruff format src ros2 docker tests benchmarks docs/*.py
+	$(BIN)/ruff format src ros2 docker tests benchmarks docs/*.py .ci
+
+release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushing the tag publishes it
+	$(PYTHON) .ci/release.py $(VERSION)
 
 # torch first and by itself: pinned, so that no other build is drawn in.
 .venv/installed: pyproject.toml constraints.txt
