@@ -249,7 +249,9 @@ def test_the_users_labels_are_not_replaced_by_those_of_other_classes(
 
     before = contents(tmp_path)
     command = f"predict {tmp_path}/own.yaml {WEIGHTS} --out {tmp_path} --overwrite"
-    assert "a.label: expected an output that is no input" in refusal(command.format(world=world))
+    assert "a.label: expected an output that is not an input" in refusal(
+        command.format(world=world)
+    )
     assert contents(tmp_path) == before
 
 

@@ -65,31 +65,33 @@ def load(
 ) -> Segmenter:
     """Return a segmenter with trained weights.
 
-    The engine `onnx` exports the networks once, in half a minute, and keeps them in $AMVNET_CACHE.
-    It takes scans one by one, and runs the networks on a GPU if the installed ONNX Runtime can.
-    `int8` does the same on the CPU with convolutions in 8-bit integers, which it calibrates once,
-    in a few minutes, on simulated scans of the weights' sensor.
+    The engine `onnx` exports the networks once, which takes half a minute, and keeps them in
+    $AMVNET_CACHE. It takes scans one by one, and runs the networks on a GPU if the installed ONNX
+    Runtime supports it. The engine `int8` does the same on the CPU, with convolutions in 8-bit
+    integers. It calibrates them once on simulated scans of the weights' sensor, which takes a few
+    minutes.
 
     Args:
         weights: trained weights, the path of a weights file, the name of built-in weights
             (`sim-hdl64e`, `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
-        device: where to compute: "cpu", "cuda", "cuda:1", ..., or "auto": "cuda" if there is a GPU
-            and the engine is "torch", else "cpu".
+        device: the device to compute on: "cpu", "cuda", "cuda:1", ..., or "auto", which is "cuda"
+            if there is a GPU and the engine is "torch", else "cpu".
         method: "amvnet", or for comparison "rv" or "bev" (one network), "rv-knn" (the range view
             with a vote of neighbours), "ensemble" (geometric mean), "arithmetic" or "maximum".
         precision: the precision of the two networks: "float32", "bfloat16", on a GPU "float16", or
-            "auto": bfloat16 on a GPU that has it, else float32. Everything else is computed in
-            float32, the projections in float64.
-        engine: what runs the networks: "torch", "onnx" or "int8".
-        tau: points whose class probabilities by the two networks have a cosine similarity of at
-            most this are uncertain, in [0, 1]; None takes the threshold of the weights.
+            "auto", which is bfloat16 on a GPU that supports it, else float32. The projections are
+            computed in float64, everything else in float32.
+        engine: the program that runs the networks: "torch", "onnx" or "int8".
+        tau: the highest cosine similarity of the two networks' class probabilities at which a point
+            is uncertain, in [0, 1]. By default, it is the threshold of the weights.
         graphs: on a GPU, capture the networks as CUDA graphs.
         report: called with a line that names the device, and with a line before long work.
 
     Raises:
-        InputError: if there are no such weights, they lack a part that the method needs, there is
-            no such method, device, precision or engine, tau is out of range, the engine lacks a
-            library, or the sensor of the weights cannot be simulated for int8.
+        InputError: if there are no such weights; if they lack a part that the method needs; if
+            there is no such method, device, precision or engine; if tau is out of range; if a
+            library of the engine is missing; or if the sensor of the weights cannot be simulated
+            for int8.
     """
     from amvnet.inference.segmenter import Segmenter
     from amvnet.weights.file import Weights
@@ -108,7 +110,7 @@ def load(
         from amvnet.models.methods import check_method
 
         check_choice(engine, device, precision)
-        check_method(method, loaded.parts)  # an export takes long
+        check_method(method, loaded.parts)  # before the export, which takes long
         is_int8 = engine == "int8"
         networks = cached_networks(loaded, SIMULATED if is_int8 else None, report)
         made = OnnxEngine(loaded, networks, method, tau, int8=is_int8)
@@ -118,7 +120,7 @@ def load(
     return segmenter
 
 
-# Hidden from type checkers, which would take any name for one of the package.
+# Hide this function from type checkers, which would otherwise accept any name of the package.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:

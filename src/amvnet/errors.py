@@ -1,4 +1,4 @@
-"""Exceptions for input that cannot be used."""
+"""Define the exceptions for input that cannot be used, and write their messages."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """Input that cannot be used.
+    """Raised for input that cannot be used.
 
-    The message is one line that says what was expected, what was found and what to do. The
-    command line prints it to stderr and exits with code 2; from Python it is a `ValueError`.
+    The message is one line that states what was expected, what was found and what to do. The
+    command line prints it to stderr and exits with code 2. In Python, it is a `ValueError`.
     """
 
 
 def shown(value: object) -> str:
-    """Return a short text on one line that shows a value of a file or an option in a message.
+    """Return a short text on one line, for a message, that shows a value of a file or an option.
 
-    Values of files may be megabytes long, or contain themselves.
+    Such values may be megabytes long, or contain themselves.
     """
     text = reprlib.Repr()
     text.maxlevel = 2
@@ -31,10 +31,10 @@ def shown(value: object) -> str:
     return text.repr(value)
 
 
-# The user name and password of a URL; a password may hold slashes that should have been escaped.
+# Matches the user name and the password of a URL. A password may contain unescaped slashes.
 CREDENTIALS = re.compile(r"(\w+)://(?:([^/\s]*)|[^/\s@:]+:(?!\d+/)\S*)@")
-CONTAINERS = ("abfs", "abfss", "wasb", "wasbs")  # schemes of URLs with CONTAINER@ACCOUNT
-# The parameters of a URL that prove who asks: keys, tokens, signatures.
+CONTAINERS = ("abfs", "abfss", "wasb", "wasbs")  # schemes of URLs that have CONTAINER@ACCOUNT
+# Matches the parameters of a URL that are keys, tokens or signatures.
 SECRET_PARAMETERS = re.compile(
     r"([?&][^?&=\s]*(?:key|secret|token|sig|signature|password|credential)[^&=\s]*=)[^&\s]+",
     re.IGNORECASE,
@@ -61,10 +61,12 @@ def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") ->
     """Return the end of an error message: the most similar known name, or else the advice.
 
     Args:
-        advice: what to do if no name is similar.
+        word: the unknown word.
+        known: the known names.
+        advice: what the user should do if no name is similar.
     """
     names = {name.lower(): name for name in known}
-    longest = 2 * max(map(len, names), default=0)  # a longer word is similar to no name
+    longest = 2 * max(map(len, names), default=0)  # no longer word is similar to a name
     similar = difflib.get_close_matches(word[:longest].lower(), names, n=1)
     if not similar:
         return f"; {advice}"
@@ -72,13 +74,13 @@ def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") ->
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the first line of an error's message; if it has none, the name of its class."""
+    """Return the first line of an error's message, or the name of its class if it has none."""
     lines = str(error).splitlines() or [type(error).__name__]
     return lines[0]
 
 
 class SomeBroken(Exception):
-    """Some inputs could not be used; all others have been processed.
+    """Raised at the end if some inputs could not be used. All others have been processed.
 
     Attributes:
         faults: one line for each broken input.
@@ -94,13 +96,13 @@ def one_line_errors(
     message: Callable[[BaseException], str],
     only: tuple[type[Exception], ...] = (Exception,),
 ) -> Iterator[None]:
-    """Turn whatever a library raises on bad input into an `InputError` of one line.
+    """Turn exceptions that a library raises for bad input into an `InputError` of one line.
 
-    An `InputError` passes unchanged, as does an interrupt by the user.
+    An `InputError` passes unchanged, and so does an interruption by the user.
 
     Args:
-        message: returns the line for an exception.
-        only: the exceptions to convert; others pass unchanged.
+        message: a function that returns the line for an exception.
+        only: the classes of exceptions to convert. Other exceptions pass unchanged.
 
     Raises:
         InputError: if the block raises one of the exceptions to convert, or a library written in
@@ -117,7 +119,7 @@ def one_line_errors(
         raise InputError(message(error)) from error
 
 
-# Errors of the system that are about this process, and not about the file that it opens.
+# Errors of the system that concern this process, and not the file that it opens.
 EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
@@ -128,7 +130,7 @@ def readable(path: object) -> Iterator[None]:
     The file may have vanished since it was listed, may be private, or its disk may be broken.
 
     Raises:
-        InputError: if the block raises an OSError that is about the file.
+        InputError: if the block raises an OSError that concerns the file.
     """
     try:
         yield
@@ -141,10 +143,14 @@ def readable(path: object) -> Iterator[None]:
 
 
 def import_optional(module: str, extra: str) -> Any:
-    """Import a module that needs the packages of one of this package's extras.
+    """Import a module that needs the packages of an extra.
+
+    Args:
+        module: the name of the module.
+        extra: the name of the extra of this package.
 
     Raises:
-        InputError: if one of them is not installed.
+        InputError: if one of the packages is not installed.
     """
     try:
         return import_module(module)
@@ -164,7 +170,7 @@ def errors_of(source: object) -> Iterator[None]:
         raise InputError(text if text.startswith(str(source)) else f"{source}: {text}") from None
 
 
-# What PyTorch, CUDA, the loader of libraries and the system say if no memory is left.
+# Matches messages of PyTorch, CUDA, the loader of libraries and the system if no memory is left.
 NO_MEMORY = re.compile(
     r"out of memory|(can't|cannot) allocate|failed to map segment", re.IGNORECASE
 )
@@ -172,10 +178,10 @@ NO_MEMORY = re.compile(
 
 @contextmanager
 def memory_for(content: str) -> Iterator[None]:
-    """Turn an error that says that no memory is left into an `InputError`.
+    """Turn an error for lack of memory into an `InputError`.
 
     Args:
-        content: what the memory is for, such as the name of a scan.
+        content: the content that needs the memory, such as the name of a scan.
 
     Raises:
         InputError: if there is no memory left for the block.

@@ -18,15 +18,16 @@ from yaml.reader import ReaderError
 
 from amvnet.errors import InputError, shown
 
-LARGEST_YAML = 50_000  # size of a YAML file, bytes; PyYAML takes a second for it
-DEEPEST_YAML = 50  # levels of nested values in a YAML file
-LONGEST_INTEGER = 40  # digits of a whole number in a YAML file
-INTEGER = "tag:yaml.org,2002:int"
-UNFINISHED_FILES = f".{'[0-9a-f]' * 32}.part*"  # pattern of their names
-CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # characters that names of files must not have
-# Errors of the system that the user can avoid by naming another file.
+LARGEST_YAML = 50_000  # largest size of a YAML file, bytes; PyYAML takes a second for it
+DEEPEST_YAML = 50  # most levels of nested values in a YAML file
+LONGEST_INTEGER = 40  # most digits of a whole number in a YAML file
+INTEGER = "tag:yaml.org,2002:int"  # PyYAML's tag of whole numbers
+# A pattern that matches the names of files that `atomic_write` has not finished.
+UNFINISHED_FILES = f".{'[0-9a-f]' * 32}.part*"
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # matches characters that file names must not have
+# Errors of the system that the user can avoid with the name of another file.
 REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENAMETOOLONG)
-LONGEST_NAME = 255  # longest name of a file in most file systems, bytes
+LONGEST_NAME = 255  # longest file name in most file systems, bytes
 LONGEST_ENDING = 20  # longest ending that an unfinished file keeps, characters
 
 unfinished: set[Path] = set()  # files and folders to remove if the process exits at once
@@ -37,13 +38,13 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it to `path` if the block succeeds.
 
     The temporary file lies in the same folder, which is made if necessary, and has the same ending.
-    It is removed if the block raises. The file gets the mode that the umask gives, even if a
-    library writes private files.
+    It is removed if the block raises. The mode of the file follows the umask, even if a library
+    writes private files.
 
-    The content is on the disk before the file has its name. So after a power cut there is either
-    the whole old file or the whole new file. A power cut may lose the last files on file systems
-    that do not write folders on request. It may also lose what is written without this function,
-    such as the last lines of a journal.
+    The content is on the disk before the file has its name. After a power cut, there is either the
+    whole old file or the whole new file. Some file systems do not write folders on request, so that
+    a power cut may lose the last files. It may also lose content that is written without this
+    function, such as the last lines of a journal.
 
     If the name of the file is made from data, join it to the folder with `inside`.
 
@@ -72,21 +73,21 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
 
         if error.filename == str(part):
             error.filename = str(path)
-        if error.filename is None:  # NumPy says only how many bytes were written
+        if error.filename is None:  # as in NumPy's error
             raise OSError(error.errno or errno.EIO, str(error), str(path)) from None
         raise
     finally:
-        with suppress(OSError):  # of a read-only file system
+        with suppress(OSError):  # the file system may be read-only
             part.unlink(missing_ok=True)
         unfinished.discard(part)
 
 
 @contextmanager
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
-    """Yield a new folder, which is removed at the end, also if the process exits at once.
+    """Yield a new folder, which is removed at the end, even if the process exits at once.
 
     Args:
-        parent: the folder that it is made in; by default the system's folder for temporary files.
+        parent: the folder in which it is made. By default, it is the system's temporary folder.
     """
     if parent is None:
         folder = Path(tempfile.mkdtemp(prefix="amvnet-"))
@@ -103,7 +104,10 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 
 
 def publish(part: Path, path: Path) -> None:
-    """Write a finished file to the disk, then give it its name in the same file system."""
+    """Write a finished file to the disk, and then rename it from `part` to `path`.
+
+    Both paths are in the same file system.
+    """
     with part.open("rb+") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
@@ -118,7 +122,7 @@ def publish(part: Path, path: Path) -> None:
 def inside(folder: Path | str, name: Path | str) -> Path:
     """Return the path of an output file whose name is made from data, such as a token of a table.
 
-    Call this each time before a file is written, because links may appear on the disk in between.
+    Call this immediately before a file is written, because links may appear on the disk.
 
     Args:
         folder: the output folder, which may itself be a link.
@@ -146,6 +150,9 @@ def check_no_links(folder: Path) -> None:
     """Check that no folder inside an output folder is a link.
 
     Call this before another library writes into the folder.
+
+    Raises:
+        InputError: if there is such a link.
     """
     for pattern in ("*", "*/*", "*/*/*"):
         for path in folder.glob(pattern):
@@ -161,7 +168,7 @@ def _refuse_link(path: Path) -> None:
 
 
 def fault_of_name(name: Path) -> str | None:
-    """Return what is wrong with the name of an output file, relative to its folder, or None."""
+    """Return the fault of an output file's name, which is relative to its folder, or None."""
     if name.anchor or ".." in name.parts or not name.name:
         return "a path that leads elsewhere"
     if CONTROL.search(str(name)):
@@ -175,7 +182,11 @@ def fault_of_name(name: Path) -> str | None:
 
 
 def checked_token(text: object) -> str:
-    """Return a token that becomes the name of a file; raise InputError if it is no plain name."""
+    """Return a token that is to be the name of a file.
+
+    Raises:
+        InputError: if it is not a plain name.
+    """
     if (
         not isinstance(text, str)
         or not text.isprintable()
@@ -202,10 +213,13 @@ def make_folder(path: Path) -> None:
 
 
 def read_yaml(path: Path, content: str) -> Any:
-    """Return what a YAML file holds: dictionaries, lists, texts, numbers. Nothing is executed.
+    """Return the content of a YAML file: dictionaries, lists, texts and numbers.
+
+    Nothing in the file is executed.
 
     Args:
-        content: what the file should hold, such as "a label map"; messages state it.
+        path: the file.
+        content: the expected content, for messages, such as "a label map".
 
     Raises:
         InputError: if the file cannot be read, is too large, or is not YAML.
@@ -223,9 +237,10 @@ def read_yaml(path: Path, content: str) -> Any:
 
 
 def parse_yaml(text: str, expected: str) -> Any:
-    """Return the value of a YAML text. Nothing is executed.
+    """Return the value of a YAML text. Nothing in it is executed.
 
     Args:
+        text: the text.
         expected: the beginning of error messages.
 
     Raises:
@@ -257,11 +272,11 @@ def _fault_of_yaml(error: Exception, text: str) -> str:
 
 
 class _BoundedLoader(yaml.SafeLoader):
-    """PyYAML's safe loader without features that can take hours or any amount of memory.
+    """PyYAML's safe loader without features that can take hours or unlimited memory.
 
     The depth of values and the length of numbers are limited. Aliases are refused, because ten
-    lines of them can stand for billions of values. A key may not stand twice, because one value
-    would be lost.
+    lines with aliases can stand for billions of values. A key may not occur twice, because one of
+    its values would be lost.
     """
 
     def __init__(self, stream: str) -> None:
@@ -281,7 +296,7 @@ class _BoundedLoader(yaml.SafeLoader):
         return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        # PyYAML checks the kinds of the nodes, so it comes first.
+        # Call PyYAML first, because it checks the kinds of the nodes.
         mapping = super().construct_mapping(node, deep)
         keys = set()
         for key_node, _ in node.value:

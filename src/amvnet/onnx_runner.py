@@ -1,6 +1,6 @@
-"""Segment scans with the files of `amvnet export`: NumPy, SciPy and ONNX Runtime, but no torch.
+"""Segment scans with the files of `amvnet export`, without torch.
 
-This module is meant to be read, and to be ported to other languages.
+It needs only NumPy, SciPy and ONNX Runtime, and is meant to be ported to other languages.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class OnnxSegmentation:
 
     Attributes:
         labels: (N,) uint8 train ids, 1..K; 0 for points that are not valid (`Scan.valid`).
-        uncertain: (N,) bool: True if the two networks disagree; all False for a single network.
-        scores: (N, K) float32 probabilities; column c belongs to train id c + 1. Zeros for points
-            that are not valid. The rows of an ensemble do not add up to 1.
+        uncertain: (N,) bool: whether the two networks disagree; False for a single network.
+        scores: (N, K) float32 probabilities. Column c belongs to train id c + 1. Points that are
+            not valid have zeros. The rows of an ensemble do not add up to 1.
     """
 
     labels: np.ndarray
@@ -97,12 +97,12 @@ class OnnxSegmenter:
 
         Args:
             points: (N, 4) x, y, z in metres and intensity in [0, 1]; or a `Scan`.
-            ring: (N,) index of the laser, 0 is the lowest. Needed if the rows of the exported
+            ring: (N,) index of the laser; 0 is the lowest. It is needed if the rows of the exported
                 range view are rings.
 
         Raises:
-            InputError: if no point is valid, more than a few intensities are out of range, the
-                shapes do not fit, or rings are missing or out of range.
+            InputError: if no point is valid; if more than a few intensities are out of range; if
+                the shapes do not fit; or if rings are missing or out of range.
         """
         if isinstance(points, Scan):
             scan = points
@@ -151,7 +151,7 @@ class OnnxSegmenter:
                 )
 
     def _scores(self, scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-        """Return (P, K) probabilities of finite points, and (P,) bool: which are uncertain."""
+        """Return (P, K) probabilities of finite points, and (P,) bool: the uncertain points."""
         points = scan.points
         none_uncertain = np.zeros(len(points), dtype=bool)
         if self.method == "rv":
@@ -218,7 +218,7 @@ class OnnxSegmenter:
 
 
 def _read_intensity(folder: Path, description: Mapping[str, Any]) -> TrainedIntensity | None:
-    """Return what the intensities of each scan are brought to; None if they stay as they are."""
+    """Return the distribution to which intensities are matched, or None to leave them unchanged."""
     values = description.get("intensity")
     if values is None:
         return None
@@ -228,7 +228,7 @@ def _read_intensity(folder: Path, description: Mapping[str, Any]) -> TrainedInte
 
 
 def _takes_fractions(description: Mapping[str, Any]) -> bool:
-    """Return whether the graphs take intensities in [0, 1]; false if trained with others."""
+    """Return whether the graphs take intensities in [0, 1], as most weights do."""
     points = description.get("points")
     return not isinstance(points, Mapping) or points.get("intensity", "missing") is not None
 
@@ -237,10 +237,10 @@ def range_image(view: RangeViewConfig, scan: Scan) -> tuple[np.ndarray, np.ndarr
     """Project P finite points to a range image.
 
     Returns:
-        The image (1, 6, H, W) float32, and each point's pixel (P,), counted row by row.
+        The image (1, 6, H, W) float32, and the (P,) pixel of each point, counted row by row.
 
     Raises:
-        InputError: if rows are rings, and the scan has none or one is out of range.
+        InputError: if the rows are rings, and the scan has no rings or a ring is out of range.
     """
     points = scan.points
     x, y, _ = points[:, :3].astype(np.float64).T
@@ -249,8 +249,8 @@ def range_image(view: RangeViewConfig, scan: Scan) -> tuple[np.ndarray, np.ndarr
 
     pixel = image_rows(view, scan) * view.width + column
 
-    # Written from the farthest to the nearest point, so that a pixel keeps the nearest one, and
-    # the first of equally near ones.
+    # Write the points from the farthest to the nearest, so that a pixel keeps the nearest point,
+    # and the first of several points that are equally near.
     order = np.argsort(distance, kind="stable")[::-1]
     order = order[distance[order] >= view.nearest]
     image = np.zeros((view.height * view.width, CHANNELS), dtype=np.float32)
@@ -259,10 +259,10 @@ def range_image(view: RangeViewConfig, scan: Scan) -> tuple[np.ndarray, np.ndarr
 
 
 def image_rows(view: RangeViewConfig, scan: Scan) -> np.ndarray:
-    """Return the rows (P,) of P finite points in the range image, 0 the top.
+    """Return the (P,) rows of P finite points in the range image; 0 is the top row.
 
     Raises:
-        InputError: as `range_image`.
+        InputError: if the rows are rings, and the scan has no rings or a ring is out of range.
     """
     if scan.row is not None and (scan.row >= 0).all():
         return scan.row
@@ -309,11 +309,11 @@ def polar_features(
 
 
 def pool(pillar: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the occupied pillars (M,), ascending, and the maximum (M, C) of each one's features.
+    """Return the (M,) occupied pillars in ascending order, and their (M, C) maximum features.
 
     Args:
         pillar: (P,) pillar of each point.
-        features: (P, C) of the points.
+        features: (P, C) features of the points.
     """
     order = np.argsort(pillar, kind="stable")
     occupied, starts = np.unique(pillar[order], return_index=True)
@@ -321,7 +321,7 @@ def pool(pillar: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def disagree(assertion: AssertionConfig, f: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """Return (P,) bool: True if a point is uncertain by the networks' probabilities f, g (P, K)."""
+    """Return (P,) bool: whether a point is uncertain, given probabilities f and g, (P, K)."""
     squared_lengths = (f * f).sum(axis=1) * (g * g).sum(axis=1)
     similarity = (f * g).sum(axis=1) / np.sqrt(np.maximum(squared_lengths, TINY))
     uncertain: np.ndarray = np.minimum(similarity, 1) <= assertion.threshold
@@ -329,14 +329,14 @@ def disagree(assertion: AssertionConfig, f: np.ndarray, g: np.ndarray) -> np.nda
 
 
 def softmax(scores: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Turn logits (P, K) into probabilities."""
+    """Return the (P, K) probabilities of logits (P, K)."""
     powers = np.exp(scores - scores.max(axis=1, keepdims=True))
     probabilities: NDArray[np.float32] = powers / powers.sum(axis=1, keepdims=True)
     return probabilities
 
 
 def _cells(share: NDArray[np.floating], cells: int) -> NDArray[np.int64]:
-    """Return which of `cells` equal parts of [0, 1] holds a number; if outside, the nearest."""
+    """Return which of `cells` equal parts of [0, 1] holds a number, or else is nearest to it."""
     nearest: NDArray[np.int64] = np.clip(np.floor(share * cells).astype(np.int64), 0, cells - 1)
     return nearest
 
@@ -358,7 +358,7 @@ def _check_rings(ring: np.ndarray | None, height: int) -> np.ndarray:
 
 
 def _fill_in(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Spread values (P, ...) of the valid points over all points (N, ...), zeros elsewhere."""
+    """Spread values (P, ...) of valid points over all points (N, ...). Other points get zeros."""
     filled = np.zeros((len(valid), *values.shape[1:]), dtype=values.dtype)
     filled[valid] = values
     return filled
@@ -368,7 +368,7 @@ def read_description(folder: Path) -> dict[str, Any]:
     """Return the description of the graphs in a folder.
 
     Raises:
-        InputError: if there is none, or it lacks a graph or the classes.
+        InputError: if there is no description, or it lacks a graph or the classes.
     """
     path = folder / DESCRIPTION
     description = None
@@ -400,7 +400,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def _is_complete(graph: Any) -> bool:
-    """Return whether a graph's description has a file of the folder, and inputs with names."""
+    """Return whether the description of a graph names a file of the folder, and its inputs."""
     if not isinstance(graph, dict) or not isinstance(graph.get("file"), str):
         return False
     if Path(graph["file"]).name != graph["file"] or len(graph["file"]) > LONGEST_NAME:
@@ -413,7 +413,7 @@ def _is_complete(graph: Any) -> bool:
 
 
 def read_graph(folder: Path, graph: Mapping[str, Any]) -> bytes:
-    """Return the content of a graph's file; raise InputError if it is not the described one."""
+    """Return the content of a graph's file; raise InputError if it differs from the description."""
     path: Path = folder / graph["file"]
     if not path.is_file():
         raise InputError(f"{path}: expected a graph of amvnet export, found no file; export again")
@@ -448,14 +448,14 @@ def open_session(path: Path, content: bytes, providers: Sequence[str]) -> Any:
 
     try:
         return onnxruntime.InferenceSession(content, providers=list(providers))
-    except Exception as error:  # one of a dozen classes without a common base of their own
+    except Exception as error:  # because ONNX Runtime's dozen classes have no common base
         raise InputError(
             f"{path}: expected a graph of amvnet export, found: {reason_of(error)}; export again"
         ) from None
 
 
 def _open_graph(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -> Any:
-    """Open a graph in ONNX Runtime; raise InputError if it is not the described one."""
+    """Open a graph in ONNX Runtime; raise InputError if it differs from the description."""
     path = folder / graph["file"]
     session = open_session(path, read_graph(folder, graph), providers)
     inputs = [(value.name, value.shape) for value in session.get_inputs()]

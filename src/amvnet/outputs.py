@@ -1,4 +1,7 @@
-"""Which files a command may write: none that it reads, and only its own kind if they exist."""
+"""Check which files a command may write.
+
+A command writes no file that it reads, and replaces only files of its own kind.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,17 @@ from pathlib import Path
 
 from amvnet.errors import InputError
 
-HEAD = 4096  # bytes at the beginning of a file that a signature looks at
+HEAD = 4096  # length of the beginning of a file that is compared with a signature, bytes
 
 
 @dataclass(frozen=True)
 class Signature:
-    """How the files of one kind begin.
+    """The beginning of all files of one kind.
 
     Attributes:
-        name: of the kind, for messages, such as "a page of view".
+        name: the name of the kind, for messages, such as "a page of view".
         beginning: a regular expression that matches the beginning of each such file.
-        unit: bytes; the sizes of such files are multiples of it.
+        unit: a size in bytes. The size of each such file is a multiple of it.
     """
 
     name: str
@@ -30,7 +33,7 @@ class Signature:
     unit: int = 1
 
     def matches(self, path: Path) -> bool:
-        """Return whether a file may be of this kind. An empty file may be of any."""
+        """Return whether a file may be of this kind. An empty file may be of any kind."""
         with path.open("rb") as file:
             head = file.read(HEAD)
         if not head:
@@ -46,14 +49,14 @@ def check_outputs(
 ) -> None:
     """Check that a command may write some files. Call this before the work.
 
-    No file that the command reads is written, by whatever name or link. A file that exists is
-    replaced only if the user says so, and only by one of the same kind. The folders of the files
-    may be written to, so that no time is wasted on results that have no place.
+    A command may not write a file that it reads, under any name or link. It may replace a file only
+    if the user allows it, and only by a file of the same kind. This function also checks that the
+    folders of the files can be written to, so that no time is wasted on results without a place.
 
     Args:
-        outputs: the files, and what each of them must be if it exists and is to be replaced.
-        inputs: files that the command reads; what names no file is left out.
-        overwrite: whether the user says that files may be replaced.
+        outputs: the files, each with the kind that it must have if it exists.
+        inputs: files that the command reads. Entries that name no file are ignored.
+        overwrite: whether the user allows the command to replace files.
 
     Raises:
         InputError: if one of the files may not be written.
@@ -84,10 +87,10 @@ def check_outputs(
 
 
 def check_not_read(outputs: Iterable[Path], inputs: Iterable[Path | str | None]) -> None:
-    """Check that no output is a file that the command reads, also by a link.
+    """Check that no output is a file that the command reads, under any name or link.
 
     Raises:
-        InputError: if one is.
+        InputError: if an output is such a file.
     """
     existing = [path for path in outputs if os.path.lexists(path)]
     if not existing:
@@ -102,13 +105,13 @@ def check_not_read(outputs: Iterable[Path], inputs: Iterable[Path | str | None])
         for identity in _identities(path):
             if identity in read:
                 raise InputError(
-                    f"{path}: expected an output that is no input, found the input "
+                    f"{path}: expected an output that is not an input, found the input "
                     f"{read[identity]}; write to another place"
                 )
 
 
 def _identities(path: Path | str) -> Iterator[tuple[int, int]]:
-    """Yield what identifies a file, and if it is a link, also what identifies the link."""
+    """Yield the device and the inode of a file, and the same of the link if the path is a link."""
     for follows in (True, False):
         with suppress(OSError, ValueError):  # nothing has this name
             status = os.stat(path, follow_symlinks=follows)
@@ -117,7 +120,7 @@ def _identities(path: Path | str) -> Iterator[tuple[int, int]]:
 
 
 def _check_writable(folder: Path) -> None:
-    """Raise InputError if a folder, or the first above it that exists, cannot be written to."""
+    """Raise InputError if a folder, or the first existing folder above it, is read-only."""
     place = folder
     while not os.path.lexists(place) and place != place.parent:
         place = place.parent
@@ -129,7 +132,7 @@ def _check_writable(folder: Path) -> None:
 
 
 def _no_file(path: Path) -> str | None:
-    """Return in words what a path is if it is neither a file nor a link to nothing."""
+    """Return in words what a path names if it names neither a file nor a broken link, or None."""
     if path.is_dir():
         return "a folder"
     return None if path.is_file() or path.is_symlink() else "a device"

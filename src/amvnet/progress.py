@@ -8,22 +8,22 @@ from collections.abc import Callable
 Progress = Callable[[int, int], None]  # takes the number of things done, and their total
 Reporter = Callable[[str], None]  # takes a line about what happens, such as `print`
 
-QUIET_SECONDS = 20  # time from the start in which no line is due, seconds
+QUIET_SECONDS = 20  # time after the start in which no line is due, seconds
 
 
 class Tenths:
-    """Decides when a line about progress is due: at most ten times, and not at the beginning."""
+    """Decides when a line about progress is due: at most ten times, and not near the start."""
 
     def __init__(self) -> None:
         self._start = time.monotonic()
-        self._said = 0
+        self._reported = 0  # number of tenths at the last line
 
     def ends(self, done: int, total: int) -> bool:
-        """Return whether the last of `done` things has completed another tenth of all of them."""
+        """Return whether a line is due, because another tenth of `total` things is done."""
         tenths = 10 * done // max(total, 1)
-        if tenths <= self._said or time.monotonic() - self._start < QUIET_SECONDS:
+        if tenths <= self._reported or time.monotonic() - self._start < QUIET_SECONDS:
             return False
-        self._said = tenths
+        self._reported = tenths
         return True
 
 
@@ -31,7 +31,9 @@ def counted(count: int, noun: str, plural: str = "") -> str:
     """Return a number of things in words, such as "1 scan" or "2 scans".
 
     Args:
-        plural: the plural of the noun if it is not regular.
+        count: the number.
+        noun: the noun in the singular.
+        plural: the noun in the plural if it is irregular.
     """
     return f"{count} {noun}" if count == 1 else f"{count} {plural or f'{noun}s'}"
 

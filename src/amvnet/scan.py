@@ -1,4 +1,4 @@
-"""One LiDAR scan, as every part of the package takes it."""
+"""Define a LiDAR scan, which every part of the package takes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from amvnet.errors import InputError, shown
 
-FARTHEST = 10_000.0  # metres: no LiDAR sees that far, and squares of much larger numbers overflow
+# The largest absolute value of a valid coordinate, metres. No LiDAR sees that far, and the squares
+# of much larger numbers overflow.
+FARTHEST = 10_000.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -20,13 +22,13 @@ class Scan:
 
     Attributes:
         points: (N, 4) float32: x, y, z in metres and intensity in [0, 1]. A row is a lost return if
-            a value is not finite, a coordinate is larger than any LiDAR sees, or the point is at
-            the origin, where sensors put it: it keeps its place and gets id 0.
+            a value is not finite, if a coordinate exceeds `FARTHEST`, or if the point is at the
+            origin, where sensors put lost returns. It keeps its place and gets the id 0.
         labels: (N,) uint8 train ids (0 = ignored, 1..K), or None if there are no labels.
         ring: (N,) int64 index of the laser (0 = lowest, -1 = unknown), or None if the format has
-            none.
+            no lasers.
         row: (N,) int64 row of each point in the range image of some weights (0 = top, -1 =
-            unknown), or None. The range view finds rows that are unknown.
+            unknown), or None. The range view computes rows that are unknown.
         name: the origin of the scan, for messages.
 
     Raises:
@@ -51,7 +53,7 @@ class Scan:
         self._check_count("rows", self.row)
 
     def _check_count(self, kind: str, values: np.ndarray | None) -> None:
-        """Raise an InputError unless there is one value per point, or no values at all."""
+        """Raise InputError unless there is one value per point, or no values at all."""
         if values is None or values.shape == (len(self.points),):
             return
 
@@ -76,7 +78,11 @@ class Scan:
         return f"<{title}: {', '.join(parts)}>"
 
     def select(self, which: np.ndarray) -> Scan:
-        """Return the scan of some of the points: (N,) bool, or (M,) indices."""
+        """Return the scan with some of the points.
+
+        Args:
+            which: (N,) bool, or (M,) indices.
+        """
         return replace(
             self,
             points=self.points[which],
@@ -87,12 +93,12 @@ class Scan:
 
     @property
     def valid(self) -> np.ndarray:
-        """(N,) bool: points with four finite values, nearer than `FARTHEST`, not at 0, 0, 0."""
+        """(N,) bool: whether a point is finite, within `FARTHEST`, and not at the origin."""
         # Comparisons with NaN are false.
         if np.abs(self.points).max(initial=0) < FARTHEST:
             valid = np.ones(len(self.points), dtype=bool)
         else:
-            # Column by column: a reduction over rows of four takes ten times as long.
+            # A reduction over rows of four would take ten times as long as these columns.
             x, y, z, intensity = np.abs(self.points.T)
             valid = (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST) & (intensity < np.inf)
 
@@ -102,13 +108,13 @@ class Scan:
 
 def at_origin(xyz: NDArray[np.floating]) -> NDArray[np.intp]:
     """Return the (M,) indices of the points at 0, 0, 0, given (N, 3 or more) coordinates."""
-    on_axis = np.flatnonzero(xyz[:, 0] == 0)  # few: their other coordinates are looked at alone
+    on_axis = np.flatnonzero(xyz[:, 0] == 0)  # so few that the other coordinates take no time
     indices: NDArray[np.intp] = on_axis[(xyz[on_axis, 1] == 0) & (xyz[on_axis, 2] == 0)]
     return indices
 
 
 def check_scan(scan: Scan) -> Scan:
-    """Return a scan with at least one valid point; raise InputError if there is none."""
+    """Return the scan; raise InputError if it has no valid point."""
     if not scan.valid.any():
         problem = "none finite" if len(scan) else "none"
         raise InputError(
@@ -119,32 +125,32 @@ def check_scan(scan: Scan) -> Scan:
 
 
 class TensorLike(Protocol):
-    """What is used of a tensor of torch."""
+    """The part of torch's tensors that `as_array` uses."""
 
     def detach(self) -> Any:
         """Return the tensor without its gradient."""
 
 
 class TableLike(Protocol):
-    """What is used of a table of pandas."""
+    """The part of pandas' tables that `as_array` uses."""
 
     def to_records(self, *, index: bool) -> Any:
         """Return the rows as an array of records."""
 
 
-AnyArray = np.ndarray | Sequence[Any] | TensorLike | TableLike  # what `as_array` takes
+AnyArray = np.ndarray | Sequence[Any] | TensorLike | TableLike  # the arguments of `as_array`
 
 
 def as_array(values: AnyArray, expected: str) -> np.ndarray:
-    """Return numbers that a library or the user holds as a NumPy array.
+    """Return numbers from any library as a NumPy array.
 
     Args:
-        values: an array, also one with named fields or a mask, a tensor on any device, a table of
-            pandas, or nested lists of numbers. Masked values become NaN.
-        expected: what they are, for messages, such as "points of shape (N, 4)".
+        values: an array, which may have named fields or a mask; a tensor on any device; a table of
+            pandas; or nested lists of numbers. Masked values become NaN.
+        expected: the expected content, for messages, such as "points of shape (N, 4)".
 
     Raises:
-        InputError: if these are no numbers, or the lists have several lengths.
+        InputError: if the values are not numbers, or the lists differ in length.
     """
     numbers: Any = values
     if hasattr(values, "detach"):
