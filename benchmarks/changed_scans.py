@@ -27,10 +27,10 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
 from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
-from amvnet.sensors.lidars import AXES, HEIGHTS, make_sensor, rotation_from_degrees
+from amvnet.sensors.lidars import AXES, KNOWN_HEIGHTS, make_sensor, rotation_from_degrees
 
 GOAL = 0.9  # share of the accuracy on unchanged scans
-HEIGHT = HEIGHTS["hdl64e"]  # metres of the sensor over the ground
+HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # metres of the sensor over the ground
 
 
 @dataclass(frozen=True)

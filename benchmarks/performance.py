@@ -70,7 +70,7 @@ def without_occupied_pillars() -> None:
 
 
 def without_parts() -> None:
-    amvnet.models.polar_net.PART = 10**9
+    amvnet.models.polar_net.PART_ON_CPU = 10**9
 
 
 def without_joining() -> None:

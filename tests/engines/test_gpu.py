@@ -172,7 +172,7 @@ def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compa
 
     # Distances for each point: to all boxes, to points in blocks, and for some to all points
     blocks = split_into_blocks(xyz)
-    in_blocks = block_search.NEAREST * blocks.index.shape[1]
+    in_blocks = block_search.SEARCHED_BLOCKS * blocks.index.shape[1]
     in_all = sum(searched_among_all) / len(own) * len(xyz)
     assert len(blocks.index) + in_blocks + in_all < 0.03 * len(xyz)
 
@@ -180,7 +180,7 @@ def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compa
 def test_parts_of_little_memory_change_no_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = torch.randn(3000, 3)
     whole = nearest_others_by_blocks(xyz, torch.arange(500), N)
-    monkeypatch.setattr(block_search, "MEMORY", 1 << 20)
+    monkeypatch.setattr(block_search, "STEP_MEMORY", 1 << 20)
     assert torch.equal(nearest_others_by_blocks(xyz, torch.arange(500), N), whole)
 
 
@@ -189,7 +189,7 @@ def test_blocks_hold_every_point_once_within_their_boxes() -> None:
     blocks = split_into_blocks(xyz)
     used = blocks.index < len(xyz)
     assert torch.equal(blocks.index[used].sort().values, torch.arange(3001))
-    assert blocks.index.shape[1] <= block_search.BLOCK
+    assert blocks.index.shape[1] <= block_search.BLOCK_SIZE
 
     points = blocks.points.transpose(1, 2)  # (M, B, 3)
     assert torch.equal(points[used], xyz[blocks.index[used]])

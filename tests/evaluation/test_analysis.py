@@ -26,7 +26,7 @@ from amvnet.inference.timing import run_once
 from amvnet.models.methods import arithmetic_mean, maximum
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import Processes
-from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES
+from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY
 from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save
 
@@ -158,7 +158,10 @@ def test_a_tau_above_those_that_are_swept_is_analyzed(
 
 def with_matched_intensities(weights: Weights) -> Weights:
     """Return weights that bring each scan's intensities to others, as simulated ones do."""
-    matched = {MATCHED: True, KEY: (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist()}
+    matched = {
+        MATCHED_KEY: True,
+        QUANTILES_KEY: (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist(),
+    }
     records = {part: {**record, **matched} for part, record in weights.training.items()}
     return replace(weights, training=records)
 

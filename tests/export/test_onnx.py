@@ -30,7 +30,7 @@ from amvnet.models.methods import BOTH_NETWORKS, MethodName
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import DESCRIPTION, OnnxSegmenter, pool
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES, QUANTILES
+from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY, SIMULATED_QUANTILES
 from amvnet.weights.file import Weights, save
 
 from fixtures.commands import (
@@ -144,8 +144,8 @@ def test_other_methods_say_what_torch_says(
 
 
 def test_matched_intensities_are_in_the_description(exported: Exports, folder: Path) -> None:
-    quantiles = QUANTILES["hdl64e"]
-    records = {part: {MATCHED: True, KEY: list(quantiles)} for part in BOTH_NETWORKS}
+    quantiles = SIMULATED_QUANTILES["hdl64e"]
+    records = {part: {MATCHED_KEY: True, QUANTILES_KEY: list(quantiles)} for part in BOTH_NETWORKS}
     weights = replace(exported["elevation"].weights, training=records)
     description = describe_export(weights, "amvnet", read_description(folder)["graphs"])
     assert description["intensity"] == {

@@ -364,7 +364,7 @@ def mortal(ray_here: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "LabelScans", Mortal)
     monkeypatch.setattr(pipeline, "MeasureSensors", Measuring)
     monkeypatch.setattr(pipeline, "BLOCK", 2)
-    monkeypatch.setattr(pipeline, "MEASURED", 1)
+    monkeypatch.setattr(pipeline, "MEASURED_SCANS", 1)
     monkeypatch.setattr(pipeline, "RETRIES", 1)
 
 

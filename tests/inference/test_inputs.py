@@ -22,7 +22,7 @@ from amvnet.inference.predict import ADVICE, report_certainty
 from amvnet.inference.reading import array_scan, normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
-from amvnet.sensors.measure import MEASURED
+from amvnet.sensors.measure import MEASURED_SCANS
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import Weights, save
 
@@ -67,7 +67,7 @@ def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]
 def test_if_the_first_scans_of_a_folder_differ_each_is_measured_alone(
     tmp_path: Path, first: str, second: str
 ) -> None:
-    for seed in range(MEASURED + 1):
+    for seed in range(MEASURED_SCANS + 1):
         sensor, height = (first, 0.9) if seed < 3 else (second, 1.3)
         write(tmp_path / "both", f"s{seed}", sensor, height, seed)
         write(tmp_path / f"s{seed}", f"s{seed}", sensor, height, seed)
@@ -84,7 +84,7 @@ def test_if_the_first_scans_of_a_folder_differ_each_is_measured_alone(
 def test_a_scan_of_another_sensor_after_the_first_ones_is_measured_alone_and_told(
     tmp_path: Path,
 ) -> None:
-    for seed in range(MEASURED + 2):
+    for seed in range(MEASURED_SCANS + 2):
         write(tmp_path / "both", f"a{seed}", "os1-64", 1.0, seed)
     write(tmp_path / "both", "b", "vlp16", 2.5)
     write(tmp_path / "alone", "b", "vlp16", 2.5)
@@ -98,11 +98,11 @@ def test_a_scan_of_another_sensor_after_the_first_ones_is_measured_alone_and_tol
 
 def test_a_sensor_that_misses_points_is_still_the_same_one(tmp_path: Path) -> None:
     """Not even half of the points, as in a tunnel or in rain, make another sensor."""
-    for seed in range(MEASURED + 3):
+    for seed in range(MEASURED_SCANS + 3):
         path = write(tmp_path / "drive", str(seed), "os1-64", 1.0, seed)
         points = np.load(path)
         is_lost = np.random.default_rng(seed).random(len(points)) < 0.6
-        np.save(path, points[~is_lost] if seed > MEASURED else points)
+        np.save(path, points[~is_lost] if seed > MEASURED_SCANS else points)
 
     _, titles, lines = normalised(tmp_path / "drive")
     assert len(set(titles.values())) == 1
@@ -207,7 +207,7 @@ def test_each_file_is_read_once_and_its_format_detected_once(
 
     monkeypatch.setattr(find, "read_file", count(read_file, "read"))
     monkeypatch.setattr(find, "ending_of", count(ending_of, "detect"))
-    names = [f"{index}.bin" for index in range(MEASURED + 2)]
+    names = [f"{index}.bin" for index in range(MEASURED_SCANS + 2)]
     (tmp_path / "scans").mkdir()
     for index, name in enumerate(names):
         street(index, 300)[0].tofile(tmp_path / "scans" / name)

@@ -89,7 +89,7 @@ def neighbours_by_loop(points: Tensor, own: int) -> tuple[list[int], list[float]
 def tree(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Search for neighbours by each of the two libraries, and of a few points at a time."""
     if request.param == "by parts":
-        monkeypatch.setattr("amvnet.models.neighbours.AT_ONCE", 3)
+        monkeypatch.setattr("amvnet.models.neighbours.QUERIES_AT_ONCE", 3)
     if request.param == "scipy":
         monkeypatch.setitem(sys.modules, "pykdtree.kdtree", None)  # as if it were not installed
 
@@ -336,7 +336,7 @@ def test_a_scan_of_many_uncertain_points_is_classified_by_sectors_with_the_same_
             return score(table, uncertain, near)
 
         monkeypatch.setattr(model.point_head, "score", counted)
-        monkeypatch.setattr(point_head_module, "AT_ONCE", 64)
+        monkeypatch.setattr(point_head_module, "POINTS_AT_ONCE", 64)
         h = model.refine(batch, f, g, uncertain)
 
     assert max(classified) == 64

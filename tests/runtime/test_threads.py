@@ -168,8 +168,8 @@ def test_a_part_that_fails_ends_the_computation(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.usefixtures("two_threads")
 def test_a_scan_is_segmented_alike_however_threads_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """With many small parts; the number of threads may change the last bits."""
-    monkeypatch.setattr(point_head, "PART", 16)
-    monkeypatch.setattr(polar_net, "PART", 16)
+    monkeypatch.setattr(point_head, "PART_ON_CPU", 16)
+    monkeypatch.setattr(polar_net, "PART_ON_CPU", 16)
     points, _ = street(0)
     segmenter = amvnet.load(fresh_weights())
 

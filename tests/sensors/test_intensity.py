@@ -17,17 +17,17 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import (
-    KEY,
-    MATCHED,
+    MATCHED_KEY,
     PROBABILITIES,
-    QUANTILES,
+    QUANTILES_KEY,
+    SIMULATED_QUANTILES,
     TrainedIntensity,
     match_scan,
     matching,
     trained_intensity,
 )
 from amvnet.sensors.lidars import Sensor, rotation_from_degrees
-from amvnet.sensors.measure import MEASURED, Recording
+from amvnet.sensors.measure import MEASURED_SCANS, Recording
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights
 
@@ -40,7 +40,7 @@ from fixtures.tiny import (
     write_scan,
 )
 
-TRAINED = np.array(QUANTILES["hdl64e"])
+TRAINED = np.array(SIMULATED_QUANTILES["hdl64e"])
 
 
 def scan_points(height: float = 1.73, seed: int = 0) -> np.ndarray:
@@ -161,7 +161,7 @@ def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
     assert "a has scans of other sensors" in line
 
 
-@pytest.mark.parametrize("record", [None, 3, {KEY: []}, {"augment": 1}])
+@pytest.mark.parametrize("record", [None, 3, {QUANTILES_KEY: []}, {"augment": 1}])
 def test_weights_that_carry_no_quantiles_have_those_of_their_sensor(record: Any) -> None:
     trained = trained_intensity({"range_net": record}, "hdl64e")
     assert trained is not None
@@ -184,7 +184,9 @@ def test_weights_that_carry_no_quantiles_have_those_of_their_sensor(record: Any)
 )
 def test_quantiles_that_no_intensities_have_are_refused(values: Any) -> None:
     fails(
-        lambda: trained_intensity({"polar_net": {KEY: values}}, "hdl64e"), "quantiles", "polar_net"
+        lambda: trained_intensity({"polar_net": {QUANTILES_KEY: values}}, "hdl64e"),
+        "quantiles",
+        "polar_net",
     )
 
 
@@ -199,22 +201,22 @@ def test_scans_without_intensities_have_quantiles_of_zero_and_equal_ones_are_lef
             write_scan(root, "00", f"{index:06d}", points, raw)
         data = SemanticKitti(root)
         record = sensor_record(data, data.records(["00"]))
-        assert record[KEY] == expected
+        assert record[QUANTILES_KEY] == expected
         trained = trained_intensity({"polar_net": record}, "")
         assert (None if trained is None else trained.quantiles) == (expected or None)
 
-    matched = {"polar_net": {KEY: [0.0] * len(PROBABILITIES), MATCHED: True}}
+    matched = {"polar_net": {QUANTILES_KEY: [0.0] * len(PROBABILITIES), MATCHED_KEY: True}}
     fails(lambda: trained_intensity(matched, ""), "quantiles", "polar_net")
 
 
 def test_training_measures_the_intensities_that_weights_carry(tmp_path: Path) -> None:
     data = SemanticKitti(make_streets(tmp_path, ("00", "01"), 2))
     records = data.records(("00", "01"))
-    quantiles = sensor_record(data, records)[KEY]
+    quantiles = sensor_record(data, records)[QUANTILES_KEY]
 
     each = [np.quantile(data.read(record).points[:, 3], PROBABILITIES) for record in records]
     np.testing.assert_allclose(quantiles, np.mean(each, axis=0), atol=1e-4)
-    trained = trained_intensity({"polar_net": {KEY: quantiles}}, "")
+    trained = trained_intensity({"polar_net": {QUANTILES_KEY: quantiles}}, "")
     assert trained is not None
     assert trained.quantiles == quantiles
 
@@ -232,12 +234,12 @@ def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> 
     np.testing.assert_array_equal(segmenter(wild).labels, segmenter(clipped).labels)
     assert wild[7, 3] == 300
 
-    raw = {"range_net": {KEY: np.linspace(0, 255, 11).tolist()}}
+    raw = {"range_net": {QUANTILES_KEY: np.linspace(0, 255, 11).tolist()}}
     assert len(amvnet.load(weights_with(raw))(wrong).labels) == len(points)
 
 
-BY_SCAN = TrainedIntensity(QUANTILES["hdl64e"], is_matched=True)
-MATCHED_RECORDS = {"range_net": {MATCHED: True}, "polar_net": {MATCHED: True}}
+BY_SCAN = TrainedIntensity(SIMULATED_QUANTILES["hdl64e"], is_matched=True)
+MATCHED_RECORDS = {"range_net": {MATCHED_KEY: True}, "polar_net": {MATCHED_KEY: True}}
 
 
 @pytest.mark.parametrize(
@@ -253,7 +255,7 @@ def test_a_matched_scan_has_the_intensities_of_the_training_in_the_same_order(
 
     valid = scan.valid
     found = np.quantile(scan.points[valid, 3], PROBABILITIES)
-    np.testing.assert_allclose(found, QUANTILES["hdl64e"], atol=0.01)
+    np.testing.assert_allclose(found, SIMULATED_QUANTILES["hdl64e"], atol=0.01)
     order = np.argsort(points[valid, 3], kind="stable")
     assert (np.diff(scan.points[valid, 3][order]) >= 0).all()
     np.testing.assert_array_equal(scan.points[:, :3], points[:, :3])
@@ -287,7 +289,7 @@ def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> Non
 
 @pytest.mark.parametrize("parts", [("range_net",), ("polar_net",)])
 def test_a_network_of_real_scans_ends_the_matching(parts: tuple[str, ...]) -> None:
-    records: dict[str, Any] = {name: {MATCHED: True} for name in ("range_net", "polar_net")}
+    records: dict[str, Any] = {name: {MATCHED_KEY: True} for name in ("range_net", "polar_net")}
     trained = trained_intensity(records, "hdl64e")
     assert trained is not None
     assert trained.is_matched
@@ -318,7 +320,7 @@ def test_a_few_wild_intensities_do_not_decide_the_range() -> None:
 def test_scans_that_sway_have_the_intensities_of_their_recording() -> None:
     recording = Recording(Sensor(), None)
     points, _ = place(LASERS["os1-64"], 1.73)
-    for number in range(MEASURED + 2):
+    for number in range(MEASURED_SCANS + 2):
         pitch = 8 if number % 2 else -8
         xyz = points[:, :3].astype(np.float64) @ rotation_from_degrees(0, pitch, 0).T
         cloud = Cloud(xyz, np.linspace(0, 0.6 + 0.01 * number, len(xyz)), name="a")

@@ -12,8 +12,8 @@ import pytest
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
-from amvnet.sensors.lidars import HEIGHTS, KNOWN_SENSORS
-from amvnet.sensors.record import KEY, measure_sensor, trained_sensor
+from amvnet.sensors.lidars import KNOWN_HEIGHTS, KNOWN_SENSORS
+from amvnet.sensors.record import SENSOR_KEY, measure_sensor, trained_sensor
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights, load, save
 
@@ -109,7 +109,7 @@ def test_training_measures_height_lasers_and_field_of_view() -> None:
 @pytest.mark.parametrize("name", ["hdl64e", "hdl32e", "homemade"])
 def test_weights_without_a_record_have_the_sensor_of_the_table(name: str) -> None:
     sensor = trained_sensor({"range_net": {"seed": 0}}, name)
-    assert sensor.height == HEIGHTS.get(name)
+    assert sensor.height == KNOWN_HEIGHTS.get(name)
     assert sensor.beams == (KNOWN_SENSORS[name].beams if name in KNOWN_SENSORS else None)
 
 
@@ -117,8 +117,8 @@ def test_a_record_that_fits_the_sheet_keeps_the_lasers_of_the_sheet() -> None:
     """Lasers at two heights cannot be counted by their elevations."""
     fits = {"fov_up": 2.9, "fov_down": -23.9, "height": 1.75}
     other = {"fov_up": 15.0, "fov_down": -25.0, "height": 1.75}
-    assert trained_sensor({"range_net": {KEY: fits}}, "hdl64e").beams == 64
-    assert trained_sensor({"range_net": {KEY: other}}, "hdl64e").beams is None
+    assert trained_sensor({"range_net": {SENSOR_KEY: fits}}, "hdl64e").beams == 64
+    assert trained_sensor({"range_net": {SENSOR_KEY: other}}, "hdl64e").beams is None
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,9 @@ def test_a_record_that_fits_the_sheet_keeps_the_lasers_of_the_sheet() -> None:
     ],
 )
 def test_an_impossible_record_in_a_file_of_a_stranger_counts_for_nothing(record: Any) -> None:
-    assert trained_sensor({"range_net": {KEY: record}}, "hdl64e") == trained_sensor({}, "hdl64e")
+    assert trained_sensor({"range_net": {SENSOR_KEY: record}}, "hdl64e") == trained_sensor(
+        {}, "hdl64e"
+    )
 
 
 def test_a_weights_file_keeps_the_record(tmp_path: Path) -> None:

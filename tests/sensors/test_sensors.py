@@ -26,13 +26,13 @@ from amvnet.scan import Scan
 from amvnet.sensors.lasers import SensorGeometry, measure
 from amvnet.sensors.lidars import (
     AXES,
-    HEIGHTS,
+    KNOWN_HEIGHTS,
     KNOWN_SENSORS,
     Sensor,
     make_sensor,
     rotation_from_degrees,
 )
-from amvnet.sensors.measure import MEASURED, raise_points
+from amvnet.sensors.measure import MEASURED_SCANS, raise_points
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import save
 from lidarstreets import LIDAR_MODELS
@@ -95,7 +95,7 @@ def test_real_sensors_have_the_height_that_is_known(name: str, model: str) -> No
 
         heights.append(geometry.height)
 
-    expected = HEIGHTS[model]
+    expected = KNOWN_HEIGHTS[model]
     assert np.median(heights) == pytest.approx(expected, abs=0.1)
     assert np.abs(np.array(heights) - expected).max() < 0.2
 
@@ -279,7 +279,7 @@ def test_scans_of_one_source_keep_one_height() -> None:
         points, _ = place(LASERS["os1-64"], height, seed=seed)
         rises.append(rise_of(normaliser, points, "drive"))
 
-    assert np.ptp(rises[MEASURED:]) < 1e-5
+    assert np.ptp(rises[MEASURED_SCANS:]) < 1e-5
     assert rises[-1] == pytest.approx(1.0 - 1.73, abs=0.03)
 
 
@@ -404,9 +404,9 @@ def test_sensors_are_described_as_they_are_simulated() -> None:
         assert sensor.beams == len(simulated.elevations)
         assert sensor.fov_up == pytest.approx(top, abs=0.1)
         assert sensor.fov_down == pytest.approx(bottom, abs=0.5)
-        if name in HEIGHTS:  # the sensor of weights is mounted at one height
-            assert HEIGHTS[name] == simulated.height
-    assert set(HEIGHTS) <= set(LIDAR_MODELS)
+        if name in KNOWN_HEIGHTS:  # the sensor of weights is mounted at one height
+            assert KNOWN_HEIGHTS[name] == simulated.height
+    assert set(KNOWN_HEIGHTS) <= set(LIDAR_MODELS)
 
 
 # --- on the command line

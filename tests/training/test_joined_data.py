@@ -21,8 +21,7 @@ from amvnet.errors import InputError
 from amvnet.inference.reading import normalised, normaliser_for
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
-from amvnet.sensors.record import AS_IS
-from amvnet.sensors.record import KEY as SENSOR
+from amvnet.sensors.record import AS_IS_KEY, SENSOR_KEY
 from amvnet.training.augment import mix
 from amvnet.training.plan import open_parts, sized_by_init, without_weight_averaging
 from amvnet.training.sensor_record import sensor_record
@@ -158,8 +157,8 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
 
     record = sensor_record(scans.dataset, scans.train)
 
-    assert AS_IS not in record[SENSOR]
-    assert record[SENSOR] == sensor_record(own[0], records[0])[SENSOR]
+    assert AS_IS_KEY not in record[SENSOR_KEY]
+    assert record[SENSOR_KEY] == sensor_record(own[0], records[0])[SENSOR_KEY]
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import KEY as INTENSITIES
-from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
+from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY, SIMULATED_QUANTILES
 from amvnet.training import loaders, networks
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
@@ -217,8 +216,8 @@ def test_the_weights_describe_their_training(run: Path) -> None:
         assert training["sequences"] == ["00", "01"]
         assert training["validated_on"] == ["08"]
         assert training["seed"] == 0
-        assert len(training[INTENSITIES]) == len(PROBABILITIES)
-        assert 0 <= training[INTENSITIES][0] < training[INTENSITIES][-1] <= 1
+        assert len(training[QUANTILES_KEY]) == len(PROBABILITIES)
+        assert 0 <= training[QUANTILES_KEY][0] < training[QUANTILES_KEY][-1] <= 1
     assert weights.training["range_net"]["rv"]["epochs"] == 3
     assert weights.model.range_view.width == 64
 
@@ -357,8 +356,8 @@ def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
 
     # The intensities of all scans were brought to those that predictions are brought to.
     record = whole.training["range_net"]
-    assert record[MATCHED] is True
-    assert record[INTENSITIES] == list(QUANTILES["hdl64e"])
+    assert record[MATCHED_KEY] is True
+    assert record[QUANTILES_KEY] == list(SIMULATED_QUANTILES["hdl64e"])
 
     # Another cache, which a worker fills.
     others = ("--data", f"simulated-hdl64e:{tmp_path / 'other'}", "--training.workers", 1)
@@ -375,7 +374,10 @@ def test_tuning_weights_of_matched_intensities_matches_the_other_scans_too(
     world: Path, run: Path, tmp_path: Path
 ) -> None:
     weights = load(run / "weights.safetensors")
-    matched = {MATCHED: True, INTENSITIES: (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist()}
+    matched = {
+        MATCHED_KEY: True,
+        QUANTILES_KEY: (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist(),
+    }
     records = {part: {**record, **matched} for part, record in weights.training.items()}
     save(replace(weights, training=records), tmp_path / "init.safetensors")
 

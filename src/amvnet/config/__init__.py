@@ -1,1 +1,1 @@
-"""The numbers of a model and of its training: schema, bounds and recipes."""
+"""Define the numbers of a model and of its training: schema, bounds and recipes."""

@@ -1,4 +1,4 @@
-"""Ranges of numbers, and a base class of dataclasses that refuse numbers outside their range."""
+"""Define ranges of numbers, and a base class of dataclasses that refuse numbers out of range."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Range:
     """The numbers that a field may hold: `Annotated[float, Range(0, 1)]`.
 
     Attributes:
-        low: lower end.
-        high: upper end.
-        open: whether the ends themselves are excluded.
+        low: lower end of the range.
+        high: upper end of the range.
+        open: whether the range excludes both ends.
     """
 
     low: float
@@ -36,10 +36,10 @@ class Range:
         return f"{above} {self.low:g} and {below} {self.high:g}"
 
 
-LONGEST_TEXT = 200
-MOST_ITEMS = 12  # of a list of values, such as the channels of a network's layers
-Count = Annotated[int, Range(1, 1_000_000)]  # far above any use
-Share = Annotated[float, Range(0, 1)]
+MAX_TEXT_LENGTH = 200  # largest number of characters in a text of a file
+MAX_ITEMS = 12  # largest number of values in a list, such as the channels of a network's layers
+Count = Annotated[int, Range(1, 1_000_000)]  # number of items; the limit is far above any use
+Share = Annotated[float, Range(0, 1)]  # share of a whole
 
 
 class Checked:
@@ -49,7 +49,8 @@ class Checked:
         """Check every number.
 
         Raises:
-            InputError: if a number is not finite or out of its range; the message names the first.
+            InputError: if a number is not finite or out of its range. The message names the first
+                such number.
         """
         kinds = get_type_hints(type(self), include_extras=True)
         for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
@@ -57,8 +58,8 @@ class Checked:
             kind = kinds[name]
             if isinstance(value, tuple):
                 self.check(
-                    holds=len(value) <= MOST_ITEMS,
-                    expected=f"at most {MOST_ITEMS} values of {name}",
+                    holds=len(value) <= MAX_ITEMS,
+                    expected=f"at most {MAX_ITEMS} values of {name}",
                     found=str(len(value)),
                 )
                 item_kind = get_args(kind)[0]
@@ -68,7 +69,11 @@ class Checked:
                 _check_range(name, value, kind)
 
     def check(self, holds: bool, expected: str, found: str) -> None:
-        """Check a condition on several numbers; raise InputError if it does not hold."""
+        """Check a condition on several numbers.
+
+        Raises:
+            InputError: if the condition does not hold.
+        """
         if not holds:
             raise InputError(f"expected {expected}, found {found}; correct the values")
 
@@ -77,7 +82,7 @@ def _check_range(name: str, value: Any, kind: Any) -> None:
     if isinstance(value, float) and not math.isfinite(value):
         raise InputError(f"{name}: expected a finite number, found {value}; correct the value")
 
-    for allowed in getattr(kind, "__metadata__", ()):  # the ranges of an `Annotated` type
+    for allowed in getattr(kind, "__metadata__", ()):  # each range of an `Annotated` type
         if value not in allowed:
             raise InputError(
                 f"{name}: expected a number {allowed}, found {shown(value)}; correct the value"
@@ -85,9 +90,13 @@ def _check_range(name: str, value: Any, kind: Any) -> None:
 
 
 def check_text(name: str, value: Any) -> None:
-    """Check that a value of a file is a short text of one line; raise InputError if it is not."""
-    if not isinstance(value, str) or not value.isprintable() or len(value) > LONGEST_TEXT:
+    """Check that a value of a file is a short text of one line.
+
+    Raises:
+        InputError: if it is not.
+    """
+    if not isinstance(value, str) or not value.isprintable() or len(value) > MAX_TEXT_LENGTH:
         raise InputError(
-            f"{name}: expected a text of at most {LONGEST_TEXT} printable characters, "
+            f"{name}: expected a text of at most {MAX_TEXT_LENGTH} printable characters, "
             f"found {shown(value)}; correct the value"
         )

@@ -1,4 +1,4 @@
-"""Convert the configuration to nested dictionaries, as YAML and JSON hold them, and back."""
+"""Convert the configuration to nested dictionaries, which YAML and JSON can hold, and back."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
-DEEPEST = 20  # levels of dictionaries that are made flat
+MAX_DEPTH = 20  # largest number of nested levels that `flat` follows
 
 
 def merge_trees(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of `base`, updated with `over`.
 
-    Dictionaries under the same key are merged in the same way; any other value of `over` replaces
-    that of `base`.
+    Two dictionaries under the same key are merged in the same way. Any other value of `over`
+    replaces the value of `base`.
     """
     merged = dict(base)
     for key, value in over.items():
@@ -36,13 +36,13 @@ def from_dict(cls: type[T], tree: Any, where: str = "configuration") -> T:
     """Return a dataclass with the values of nested dictionaries.
 
     Args:
-        cls: a dataclass whose fields all have defaults.
-        tree: values by field name; fields that it does not name keep their defaults.
+        cls: a dataclass; all its fields have defaults.
+        tree: values by field name. The other fields keep their defaults.
         where: the beginning of error messages, such as the name of the file.
 
     Raises:
-        InputError: if `tree` is not a dictionary, a key is not a field, a value is not of the
-            default's type, or a number is out of its range.
+        InputError: if `tree` is not a dictionary, a key is not a field, a value does not have the
+            type of the default, or a number is out of its range.
     """
     if not isinstance(tree, Mapping):
         raise InputError(
@@ -65,11 +65,13 @@ def to_dict(config: Any) -> dict[str, Any]:
     return tree
 
 
-def flat(tree: Any, name: str = "", depth: int = DEEPEST) -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested dictionaries, each with its keys, joined by dots.
+def flat(tree: Any, name: str = "", depth: int = MAX_DEPTH) -> Iterator[tuple[str, Any]]:
+    """Yield the keys and values of nested dictionaries; dots join the keys of several levels.
 
     Args:
-        depth: levels below which a dictionary is a value.
+        tree: the nested dictionaries.
+        name: the key of `tree` itself, if it is a part of a larger tree.
+        depth: number of levels to follow. A dictionary on a deeper level is yielded as a value.
     """
     if not isinstance(tree, Mapping) or not depth:
         yield name, tree
@@ -79,7 +81,11 @@ def flat(tree: Any, name: str = "", depth: int = DEEPEST) -> Iterator[tuple[str,
 
 
 def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
-    """Return a copy of a dataclass with the values of a tree; raise the errors of `from_dict`."""
+    """Return a copy of a dataclass with the values of nested dictionaries; see `from_dict`.
+
+    Raises:
+        InputError: if `from_dict` raises it.
+    """
     field_types = get_type_hints(type(default))
 
     changes = {}
@@ -97,7 +103,11 @@ def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
 
 
 def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
-    """Convert a value to the type of a field; raise InputError if it does not fit."""
+    """Convert a value to the type of a field.
+
+    Raises:
+        InputError: if the value does not fit the type.
+    """
     wrong_type = InputError(
         f"{where}: expected a value like {default!r}, found {shown(value)}; correct the value"
     )
@@ -135,6 +145,6 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
 
 
 def _example(kind: Any) -> Any:
-    """Return a value of the type of the items of a tuple, which may be a Literal."""
+    """Return a value of the type of a tuple's items, which may be a Literal."""
     choices = get_args(kind)
     return choices[0] if choices else kind()

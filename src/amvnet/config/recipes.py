@@ -1,4 +1,4 @@
-"""Read recipes, which say what to train and how: the built-in ones and users' own."""
+"""Read recipes, built-in recipes and users' own. A recipe says what to train and how."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from amvnet.config.schema import Recipe
 from amvnet.errors import InputError, did_you_mean, shown
 from amvnet.files import read_yaml
 
-# The folder of the built-in recipes.
+# Folder of the built-in recipes.
 _FOLDER = resources.files("amvnet.config") / "recipes"
 
 
@@ -31,7 +31,8 @@ def load_recipe(name_or_path: str) -> Recipe:
     of `Recipe` (the paper's sizes) if it has no such key.
 
     Raises:
-        InputError: if there is no such recipe, or a key or value in it is not valid.
+        InputError: if there is no such recipe, a key or a value in it is not valid, or its bases
+            form a circle.
     """
     return from_dict(Recipe, _read_tree(name_or_path, ()), name_or_path)
 
@@ -40,7 +41,8 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
     """Read a recipe, merged with its bases.
 
     Args:
-        dependents: the recipes that build on this one, to detect a circle of bases.
+        name_or_path: the name of a built-in recipe, or the path of a YAML file.
+        dependents: the recipes that build on this recipe, to detect a circle of bases.
     """
     if name_or_path in dependents:
         raise InputError(
@@ -50,7 +52,7 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
 
     tree = read_yaml(_find(name_or_path), "a recipe")
 
-    # An empty file, perhaps of an interrupted download, would train at the paper's sizes.
+    # An empty file, perhaps from an interrupted download, would train at the paper's sizes.
     if not isinstance(tree, dict) or not tree:
         found = shown(tree) if tree else "an empty file"
         raise InputError(
@@ -72,7 +74,11 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
 
 
 def _find(name_or_path: str) -> Path:
-    """Return the path of a recipe."""
+    """Return the path of a recipe.
+
+    Raises:
+        InputError: if there is no such recipe.
+    """
     if name_or_path in recipe_names():
         return Path(str(_FOLDER)) / f"{name_or_path}.yaml"
 

@@ -1,7 +1,8 @@
-"""Every number of the method and of its training, in one tree of frozen dataclasses.
+"""Define every number of the method and of its training in one tree of frozen dataclasses.
 
 The defaults are the paper's sizes for SemanticKITTI. A recipe (a YAML file in `recipes/`, or a
-user's own) states only what differs from them. "Open" marks what the paper does not state.
+user's own file) states only what differs from the defaults. "(open)" marks a number that the paper
+does not state.
 """
 
 from __future__ import annotations
@@ -14,17 +15,18 @@ from amvnet.config.bounds import Checked, Range, Share
 
 StageName = Literal["rv", "bev", "head"]
 
-# Upper limits, far above any use: a weights file or a recipe of a stranger cannot fill the memory.
-MOST_CHANNELS = 8192
-Channels = Annotated[int, Range(1, MOST_CHANNELS)]
-Cells = Annotated[int, Range(1, 16384)]  # along one side of a view
-MOST_CELLS = 2**22  # of a view; the paper's range image has 2**18
-LASERS_SEEN = 0.75  # least share of a sensor's lasers that have returns in every scan
-Degrees = Annotated[float, Range(-90, 90)]  # above the horizon
+# These limits are far above any use. They keep a stranger's weights file or recipe from filling the
+# memory.
+MAX_CHANNELS = 8192  # largest number of channels in a layer
+Channels = Annotated[int, Range(1, MAX_CHANNELS)]
+Cells = Annotated[int, Range(1, 16384)]  # number of cells along one side of a view
+MAX_CELLS = 2**22  # largest number of cells in a view; the paper's range image has 2**18
+MIN_LASERS_SEEN = 0.75  # smallest share of a sensor's lasers that have returns in every scan
+Degrees = Annotated[float, Range(-90, 90)]  # elevation above the horizon
 Metres = Annotated[float, Range(-1000, 1000)]
-# Also far above any use: a mistyped number is refused before a run begins.
+# These limits are far above any use as well. They refuse a mistyped number before a run begins.
 Epochs = Annotated[int, Range(1, 100_000)]
-Scans = Annotated[int, Range(1, 100_000)]  # of a batch, or its parts
+Scans = Annotated[int, Range(1, 100_000)]  # number of scans in a batch, or of its parts
 Points = Annotated[int, Range(1, 100_000_000)]
 LearningRate = Annotated[float, Range(0, 100, open=True)]
 Factor = Annotated[float, Range(0, 1000)]
@@ -32,30 +34,31 @@ Factor = Annotated[float, Range(0, 1000)]
 
 def _check_cells(view: Checked, *sides: int) -> None:
     view.check(
-        holds=math.prod(sides) <= MOST_CELLS,
-        expected=f"at most {MOST_CELLS} cells",
+        holds=math.prod(sides) <= MAX_CELLS,
+        expected=f"at most {MAX_CELLS} cells",
         found=" x ".join(map(str, sides)),
     )
 
 
 @dataclass(frozen=True)
 class RangeViewConfig(Checked):
-    """The range image (section 3.1 of the paper; its sizes: 4.2)."""
+    """The range image (section 3.1 of the paper; section 4.2 has its sizes)."""
 
     rows: Literal["elevation", "laser", "ring"] = "elevation"
-    """What sets a point's row: its elevation in the field of view; its laser, if the lasers of the
-    scan are known and as many as the rows, else its elevation; or the index of its laser (ring),
-    which every scan must have."""
+    """What sets a point's row. elevation: its elevation in the field of view. laser: its laser if
+    the scan's lasers are known and there is one for each row, else its elevation. ring: the index
+    of its laser, which every scan must have."""
     height: Cells = 64
-    """Rows of the range image: the lasers of the sensor."""
+    """Rows of the range image, one for each laser of the sensor."""
     width: Cells = 4096
     """Columns of the range image, over 360 degrees."""
     fov_up: Degrees = 3.0
-    """Upper end of the field of view, degrees above the horizon; row 0."""
+    """Upper end of the field of view (row 0), degrees above the horizon."""
     fov_down: Degrees = -25.0
-    """Lower end of the field of view, degrees above the horizon; the last row."""
+    """Lower end of the field of view (the last row), degrees above the horizon."""
     nearest: Annotated[float, Range(0, 1000)] = 0.0
-    """Nearer points, metres, are of the car's own body: not seen, but labelled; 0: none (open)."""
+    """Range below which points belong to the car itself, metres: the network does not see them, but
+    they get labels. 0: no points (open)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,30 +72,30 @@ class RangeViewConfig(Checked):
 
     @property
     def lasers(self) -> int:
-        """Lasers to look for in a scan without rings: one a row; 0 if rows are no lasers."""
+        """Number of lasers to find in a scan without rings; 0 if the rows are not lasers."""
         return self.height if self.rows == "laser" else 0
 
     def has_laser_per_row(self, highest: Any) -> Any:
-        """Return whether a sensor has a laser for each row, by the highest ring index of a scan.
+        """Return whether a sensor has one laser for each row.
 
-        The highest lasers may look into the sky, without a return.
+        The highest lasers may look into the sky, where nothing returns.
 
         Args:
-            highest: an integer, or an array or tensor of integers.
+            highest: highest ring index in a scan: an integer, or an array or tensor of integers.
         """
-        return (highest >= LASERS_SEEN * self.height) & (highest < self.height)
+        return (highest >= MIN_LASERS_SEEN * self.height) & (highest < self.height)
 
 
 @dataclass(frozen=True)
 class PolarViewConfig(Checked):
-    """The polar grid (section 3.1 of the paper, sizes: 4.2; section 3 of PolarNet's paper)."""
+    """The polar grid (section 3.1 of the paper and 3 of PolarNet's; section 4.2 has its sizes)."""
 
     radial: Cells = 480
     """Cells along the radius."""
     angular: Cells = 360
     """Cells around the sensor."""
     vertical: Annotated[int, Range(1, 512)] = 32
-    """Cells along the height: the voxels of a pillar."""
+    """Cells along the height, which are the voxels of a pillar."""
     radius_min: Annotated[float, Range(0, 1000)] = 3.0
     """Inner radius of the grid, metres; nearer points go to the innermost cells."""
     radius_max: Metres = 50.0
@@ -102,7 +105,8 @@ class PolarViewConfig(Checked):
     z_max: Metres = 1.5
     """Upper end of the grid, metres above the sensor."""
     nearest: Annotated[float, Range(0, 1000)] = 0.0
-    """Nearer points, metres, are of the car's own body: not seen, but labelled; 0: none (open)."""
+    """Range below which points belong to the car itself, metres: the network does not see them, but
+    they get labels. 0: no points (open)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,8 +128,8 @@ class PolarViewConfig(Checked):
 class RangeNetConfig(Checked):
     """The range-view network (sections 3.1 and 4.2 of the paper; its widths are open).
 
-    With these defaults it costs 500 GMAC (billion multiply-adds) for an image of 64 x 4096: the
-    paper's head costs 1 GMAC for 10,000 points, which it calls 0.2 % of this network (3.3).
+    With these defaults, an image of 64 x 4096 costs 500 GMAC (billion multiply-adds). This is what
+    the paper implies: its head costs 1 GMAC for 10,000 points, 0.2 % of this network (section 3.3).
     """
 
     stem: Channels = 32
@@ -133,21 +137,21 @@ class RangeNetConfig(Checked):
     stem_blocks: Annotated[int, Range(0, 16)] = 0
     """Residual blocks at full resolution."""
     widths: tuple[Channels, ...] = (96, 128, 224, 384, 384, 384, 384)
-    """Channels at the width strides 2, 4, 8, ..., one entry per stride."""
+    """Channels of each stage. The width strides of the stages are 2, 4, 8, ..."""
     blocks: tuple[Annotated[int, Range(1, 16)], ...] = (2, 4, 4, 4, 2, 2, 2)
-    """Residual blocks at each of these strides."""
+    """Residual blocks of each stage."""
     height_strides: tuple[Annotated[int, Range(1, 64)], ...] = (1, 1, 1, 1, 2, 2, 2)
-    """Height stride of each of these stages: only the later ones reduce the height."""
+    """Height stride of each stage. Only the later stages reduce the height."""
     decoder: Channels = 160
     """Channels of the decoder."""
     head: Channels = 96
     """Channels of the last layers, at full resolution."""
     dropout: Annotated[float, Range(0, 0.99)] = 0.0
-    """Probability of dropping a channel of the decoder's maps, in training (open)."""
+    """Probability of dropping a channel of the decoder's maps in training (open)."""
     gru: bool = True
-    """GRU layers over the maps of the last two strides; off for the ablation (Table 5)."""
+    """Run GRU layers over the maps of the last two stages; off for the ablation (Table 5)."""
     gru_padding: Share = 0.25
-    """Share of the map's width that pads it circularly before the GRU runs over it."""
+    """Share of a map's width that is padded circularly before the GRU runs over the map."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -167,13 +171,13 @@ class PolarNetConfig(Checked):
     """The bird's-eye-view network: PolarNet (Zhang et al., CVPR 2020)."""
 
     point_widths: tuple[Channels, ...] = (64, 128, 256, 512)
-    """Channels of the shared MLP over the points of a pillar."""
+    """Channels of the layers of the shared MLP over the points of a pillar."""
     pillar: Channels = 32
     """Channels of a pillar after pooling."""
     widths: tuple[Channels, ...] = (64, 128, 256, 512, 512)
-    """Channels of the U-Net, from the full grid down."""
+    """Channels of the levels of the U-Net, from fine to coarse."""
     dropblock: Annotated[float, Range(0, 0.99)] = 0.5
-    """Probability of DropBlock in the decoder, in training."""
+    """Probability that DropBlock drops a cell of the decoder's maps in training."""
     dropblock_size: Annotated[int, Range(1, 99)] = 7
     """Side of the squares that DropBlock drops, cells."""
 
@@ -190,7 +194,7 @@ class AssertionConfig(Checked):
     """The assertion that decides which points are uncertain (section 3.2 of the paper)."""
 
     threshold: Share = 0.85
-    """tau: the largest cosine similarity of the two networks' scores of an uncertain point."""
+    """tau: largest cosine similarity of the two networks' scores at an uncertain point."""
 
 
 @dataclass(frozen=True)
@@ -198,15 +202,15 @@ class PointHeadConfig(Checked):
     """The point head (section 3.3 of the paper)."""
 
     neighbours: Annotated[int, Range(1, 1000)] = 15
-    """n: nearest neighbours of an uncertain point, among all raw points."""
+    """n: number of nearest neighbours of an uncertain point, chosen from all points of the scan."""
     hidden: tuple[Channels, ...] = (64, 32, 32)
-    """Channels of the shared MLP over the neighbours."""
+    """Channels of the layers of the shared MLP over the neighbours."""
     fc: Channels = 128
     """Channels of the fully connected layer before the scores."""
     position_scale: Factor = 0.05
-    """Factor on x, y, z (metres) as features: brings them to the magnitude of the scores."""
+    """Factor on x, y, z in metres as features, which brings them to the magnitude of the scores."""
     share: Share = 1.0
-    """Weight of the head in its geometric mean with the ensemble, in predictions (1: the paper)."""
+    """Weight of the head in predictions, in its geometric mean with the ensemble. Paper: 1."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -237,73 +241,77 @@ class AugmentConfig(Checked):
     """Augmentation of the points in training (section 3.1 of the paper lists the kinds)."""
 
     scale: Annotated[float, Range(0, 0.99)] = 0.05
-    """Scaling by 1 +- this, one factor per scan."""
+    """Scaling by a factor from 1 - this to 1 + this, one for each scan."""
     flip: Share = 0.5
     """Probability of mirroring x, and of mirroring y."""
     jitter: Annotated[float, Range(0, 10)] = 0.01
     """Standard deviation of the noise on each coordinate, metres."""
     yaw: Annotated[float, Range(0, 360)] = 180.0
-    """Rotation about the vertical by up to +- this, degrees."""
+    """Largest rotation about the vertical axis in either direction, degrees."""
     height: Annotated[float, Range(0, 100)] = 0.0
-    """Vertical shift by up to +- this, metres: sensors are mounted at various heights (open)."""
+    """Largest shift up or down, metres: the mounting heights of sensors differ (open)."""
     tilt: Annotated[float, Range(0, 45)] = 0.0
-    """Roll and pitch of the sensor by up to +- this each, degrees (open)."""
+    """Largest roll, and largest pitch, of the sensor in either direction, degrees (open)."""
     intensity: Annotated[float, Range(0, 0.99)] = 0.0
-    """Scaling of the intensity by 1 +- this, one factor per scan: calibrations differ (open)."""
+    """Scaling of the intensity by a factor from 1 - this to 1 + this, one for each scan: the
+    calibrations of sensors differ (open)."""
     intensity_offset: Share = 0.0
-    """Shift of the intensity by up to +- this, the same in all of a scan (open)."""
+    """Largest shift of the intensity up or down, one for each scan (open)."""
     intensity_gamma: Annotated[float, Range(0, 3)] = 0.0
-    """Intensity to the power of exp(+- up to this), one exponent per scan (open)."""
+    """Power of the intensity from exp(-this) to exp(this), one for each scan (open)."""
     laser_gain: Annotated[float, Range(0, 0.99)] = 0.0
-    """Scaling of the intensity by 1 +- this, one factor per scan and laser (open)."""
+    """Scaling of the intensity by a factor from 1 - this to 1 + this, one for each laser of each
+    scan (open)."""
     no_intensity: Share = 0.0
     """Probability of removing the intensity of a scan (open)."""
     drop: Annotated[float, Range(0, 0.99)] = 0.0
-    """Largest share of the points that is dropped from a scan at random (open)."""
+    """Largest share of a scan's points that is dropped at random (open)."""
     no_lasers: Share = 0.0
     """Probability of forgetting the lasers of a scan, so that elevations set its rows (open)."""
     laser_drop: Share = 0.0
-    """Probability of dropping every second laser of a scan, or up to half of them (open)."""
+    """Probability of dropping every second laser of a scan, or up to half of its lasers (open)."""
     block_drop: Share = 0.0
     """Probability of dropping a few rectangles of azimuth and elevation, as if hidden (open)."""
     mix: Share = 0.0
-    """Probability of replacing a sector by that of another training scan (PolarMix; open)."""
+    """Probability of replacing a sector by the same sector of another scan (PolarMix; open)."""
     laser_mix: Share = 0.0
     """Probability of taking every second band of elevation from another scan (LaserMix; open)."""
     paste: Share = 0.0
-    """Probability of adding the rare objects of another scan, also turned (PolarMix; open)."""
+    """Probability of adding the rare objects of another scan, some of them turned (PolarMix;
+    open)."""
 
 
 @dataclass(frozen=True)
 class NetworkTraining(Checked):
-    """Training of one of the two networks: AdamW, one-cycle (section 4.2 of the paper)."""
+    """Training of one network: AdamW and a one-cycle schedule (section 4.2 of the paper)."""
 
     epochs: Epochs
-    """Passes over the training scans."""
+    """Number of passes over the training scans."""
     batch: Scans
-    """Scans of one optimizer step."""
+    """Number of scans in one optimizer step."""
     lr: LearningRate
     """Peak of the one-cycle learning rate (open)."""
     weight_decay: Factor = 0.01
     """AdamW's weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
-    """Share of the steps before the learning rate's peak (open)."""
+    """Share of the steps before the peak of the learning rate (open)."""
     hold: Annotated[float, Range(0, 0.9)] = 0.0
-    """Share of the steps at the learning rate's peak, before it falls (open)."""
+    """Share of the steps at the peak of the learning rate, before it falls (open)."""
     region: Factor = 1.0
     """Weight of the region loss (Dice or Lovász-softmax) relative to cross-entropy (open)."""
     region_loss: Literal["default", "dice", "lovasz"] = "default"
-    """The region loss; by default the paper's: Dice for rv, Lovász-softmax for bev."""
+    """The region loss. default: the paper's loss, Dice for rv and Lovász-softmax for bev."""
     class_weights: bool = True
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
     clip: Annotated[float, Range(0, 1e6, open=True)] = 5.0
-    """Largest norm of the gradient; larger ones are scaled down (open)."""
+    """Largest norm of the gradient; larger gradients are scaled down (open)."""
     ema: Annotated[float, Range(0, 0.99999)] = 0.0
-    """Decay of the exponential moving average of the weights that is used in the end; 0: none."""
+    """Decay of the exponential moving average of the weights, which becomes the result; 0: no
+    average."""
     initial: Share = 0.0
-    """Share of the initial weights in those that are used in the end, for `--init` (open)."""
+    """Share of the initial weights of `--init` in the result, which is a mean (open)."""
     accumulate: Scans = 1
-    """Parts that each process splits its batch into, if it does not fit into memory."""
+    """Number of parts into which each process splits a batch that does not fit into memory."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -315,40 +323,44 @@ class NetworkTraining(Checked):
         )
         self.check(
             holds=self.warmup + self.hold < 1,
-            expected=f"a hold below {1 - self.warmup:g}, as the warm-up is {self.warmup:g}",
+            expected=f"a hold below {1 - self.warmup:g}, because the warm-up is {self.warmup:g}",
             found=f"{self.hold:g}",
         )
 
 
 @dataclass(frozen=True)
 class HeadTraining(Checked):
-    """Training of the point head: SGD, one-cycle, frozen networks (section 4.2 of the paper)."""
+    """Training of the head on frozen networks: SGD, one-cycle (section 4.2 of the paper)."""
 
     epochs: Epochs = 20
-    """Passes over the uncertain points of the training scans."""
+    """Number of passes over the uncertain points of the training scans."""
     batch: Points = 256
-    """Uncertain points of one optimizer step, drawn at random."""
+    """Number of uncertain points in one optimizer step, drawn at random."""
     lr: LearningRate = 0.1
     """Peak of the one-cycle learning rate (open)."""
     momentum: Annotated[float, Range(0.1, 0.999)] = 0.95
-    """SGD's largest momentum; at the learning rate's peak it is lower by 0.1 (open)."""
+    """SGD's largest momentum. At the peak of the learning rate it is lower by 0.1 (open)."""
     weight_decay: Factor = 1e-4
     """SGD's weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
-    """Share of the steps before the learning rate's peak (open)."""
+    """Share of the steps before the peak of the learning rate (open)."""
     views: Annotated[int, Range(0, 10_000)] = 0
-    """Augmented copies of each training scan to score for the head; 0: the scan itself."""
+    """Number of augmented copies of each training scan to score for the head; 0: score the scan
+    itself."""
     tau: Share = 0.0
-    """Largest cosine similarity of the points that the head learns from; 0: that of the model's
-    uncertain points (open)."""
+    """Largest cosine similarity of the points that the head learns from; 0: take the threshold of
+    the model's assertion (open)."""
     disturb: Share = 0.0
     """Probability of disturbing the scores of a network in a view of a scan (open)."""
     points: Points = 300_000
-    """Limit on the uncertain points of all scans, shared equally; 1.3 kB each on disk (K = 19)."""
+    """Largest number of uncertain points of all scans, which share it equally. Each point takes 1.3
+    kB on disk (for 19 classes)."""
     drawn: Annotated[int, Range(0, 100_000_000)] = 0
-    """Points of an epoch, other ones in each, drawn at random from those on disk; 0: all (open)."""
+    """Number of points that each epoch draws at random from the points on disk; 0: take all
+    (open)."""
     balance: Share = 0.0
-    """How far draws even out the classes: 0 draws points alike, 1 classes equally often (open)."""
+    """How much draws balance the classes. 0: all points are equally likely; 1: all classes are
+    (open)."""
 
 
 @dataclass(frozen=True)
@@ -364,18 +376,19 @@ class TrainingConfig(Checked):
     augment: AugmentConfig = AugmentConfig()
     """Augmentation of the points."""
     keep: Literal["best", "last"] = "last"
-    """Weights of a stage to use: of the last epoch, or of that of the highest validation mIoU."""
+    """The epoch whose weights a stage keeps. best: the epoch with the highest validation mIoU;
+    last: the last epoch."""
     others: Share = 0.0
-    """Share of an epoch for the second and later --data in all; 0: all of their scans."""
+    """Share of an epoch that the second and later --data take together; 0: take all their scans."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Seed of the initial weights, the order of the scans and the augmentation."""
     workers: Annotated[int, Range(0, 1024)] = 0
-    """Worker processes that read and augment scans; 0: none."""
+    """Number of worker processes that read and augment scans; 0: the training itself does it."""
     precision: Literal["auto", "32-true", "bf16-mixed", "16-mixed", "64-true"] = "32-true"
-    """Lightning's precision of the forward and backward passes; auto: bf16-mixed on a device with
-    bfloat16 arithmetic, 32-true on others; 64 to compare trainings."""
+    """Lightning's precision of the forward and backward passes. auto: bf16-mixed on a device with
+    bfloat16 arithmetic, 32-true on others. 64-true serves to compare trainings."""
     accelerator: str = "auto"
-    """Lightning's accelerator: auto, cpu, gpu."""
+    """Lightning's accelerator: auto, cpu or gpu."""
 
 
 @dataclass(frozen=True)
@@ -389,7 +402,7 @@ class Recipe:
     from_init: bool = False
     """Take the classes, the sensor and the sizes of the model from the weights of --init."""
     stages: tuple[StageName, ...] = ("rv", "bev", "head")
-    """The stages that are trained by default. A baseline trains only one of the networks."""
+    """The stages to train by default. A baseline trains only one network."""
     model: ModelConfig = ModelConfig()
     """The networks and their sizes."""
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -32,7 +32,7 @@ from amvnet.inference.predict import report_certainty
 from amvnet.inference.request import LabellingRequest
 from amvnet.models.methods import METHODS, Compute
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
-from amvnet.sensors.measure import MEASURED
+from amvnet.sensors.measure import MEASURED_SCANS
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
 os.environ.setdefault("RAY_worker_niceness", "0")  # the niceness of `predict`, in place of 15
@@ -188,12 +188,12 @@ class FleetRun:
         for index, drive in enumerate(window["drive"].to_pylist()):
             if drive not in self.results.estimates:
                 scans = first.setdefault(drive, [])
-                if len(scans) < MEASURED:
+                if len(scans) < MEASURED_SCANS:
                     scans.append(index)
         if not first:
             return
 
-        each = max(BLOCK // MEASURED, 1)
+        each = max(BLOCK // MEASURED_SCANS, 1)
         drives = list(first.values())
         groups = [drives[start : start + each] for start in range(0, len(drives), each)]
         blocks = [window.take(list(chain.from_iterable(group))) for group in groups]

@@ -26,7 +26,7 @@ from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import AnyArray, Scan, as_array
-from amvnet.sensors.intensity import prepare, trained_intensity
+from amvnet.sensors.intensity import adapt_intensity, trained_intensity
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.weights.file import Weights, load
@@ -66,7 +66,7 @@ class Fusion:
         Raises:
             InputError: if the shapes do not fit, or the scores are not probabilities.
         """
-        scan = prepare(checked_scan(points, trained=self._intensity), self._intensity)
+        scan = adapt_intensity(checked_scan(points, trained=self._intensity), self._intensity)
         f_all = as_array(f, "scores f").astype(np.float32, copy=False)
         g_all = as_array(g, "scores g").astype(np.float32, copy=False)
         self._check_shapes(scan, f_all, g_all)

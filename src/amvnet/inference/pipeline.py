@@ -34,7 +34,7 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.outputs import Signature, check_not_read, check_outputs
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
-from amvnet.sensors.measure import MEASURED
+from amvnet.sensors.measure import MEASURED_SCANS
 
 UNCERTAIN_ENDING = ".uncertain.npy"
 DIGEST_LENGTH = 16  # the hexadecimal digits of a digest in the journal
@@ -202,7 +202,7 @@ class Pipeline:
         first_of: dict[str, list[Any]] = {}  # by recording
         for scan in self.scans:
             first = first_of.setdefault(scan.source, [])
-            if len(first) < MEASURED:
+            if len(first) < MEASURED_SCANS:
                 first.append((scan.name, *_size_and_time(scan.path)))
 
         origins = {}

@@ -20,7 +20,7 @@ from amvnet.models.methods import MethodName
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.memory import return_freed_memory
 from amvnet.scan import AnyArray, Scan
-from amvnet.sensors.intensity import prepare, trained_intensity
+from amvnet.sensors.intensity import adapt_intensity, trained_intensity
 from amvnet.weights.file import Weights
 
 # The least number of points in a batch whose freed memory is returned to the system, because no
@@ -204,5 +204,5 @@ class Segmenter:
         for scan in scans:
             if scan.row is None:
                 scan = with_lasers(scan, self.weights.model.range_view.lasers)
-            prepared.append(prepare(scan, self.intensity))
+            prepared.append(adapt_intensity(scan, self.intensity))
         return PointBatch.of(prepared, self.device)

@@ -1,4 +1,4 @@
-"""The assertion finds uncertain points by comparing the two networks' scores (section 3.2)."""
+"""Find uncertain points by comparing the two networks' scores: the assertion (section 3.2)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from amvnet.errors import InputError
 
-TINY = 1e-12  # smallest divisor; it keeps the cosine of all-zero scores finite
+TINY = 1e-12  # smallest divisor, which keeps the cosine of all-zero scores finite
 
 
 # Takes the class probabilities f and g (P, K) of the two networks, and the points (P, 4): x, y, z
@@ -20,7 +20,14 @@ Assertion = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Disagreement:
-    """The paper's assertion: a point is uncertain if the cosine similarity is at most tau."""
+    """The paper's assertion: a point is uncertain if the cosine similarity is at most tau.
+
+    Attributes:
+        tau: largest cosine similarity of f and g at an uncertain point, 0 to 1.
+
+    Raises:
+        InputError: if tau is out of range.
+    """
 
     tau: float = 0.85
 
@@ -33,7 +40,7 @@ class Disagreement:
 
 
 def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
-    """Return the cosine similarity (P,) of class probabilities f and g (P, K)."""
+    """Return the cosine similarity (P,) of class probabilities f and g (P, K), at most 1."""
     lengths = f.norm(dim=1) * g.norm(dim=1)
     similarity: Tensor = torch.linalg.vecdot(f, g) / lengths.clamp_min(TINY)
     return similarity.clamp_max(1)  # rounding must not put a point beyond tau = 1

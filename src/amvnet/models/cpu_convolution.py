@@ -1,4 +1,4 @@
-"""Convolutions that are fast on a CPU."""
+"""Compute convolutions fast on a CPU."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ Pair = tuple[int, int]
 
 
 def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, stride: Pair, padding: Pair) -> Tensor:
-    """Convolve as `torch.nn.functional.conv2d`: (B, C, H, W) -> (B, C', H', W').
+    """Convolve like `torch.nn.functional.conv2d`: (B, C, H, W) -> (B, C', H', W').
 
-    With gradients, on CPUs without AVX-512: oneDNN takes five times as long for the gradient of
-    the weights as for the convolution itself. This was two thirds of a training step. Here matrix
-    products compute the gradient instead.
+    Two cases are faster than `conv2d`:
 
-    Without gradients, for 1 x 1 kernels: with one thread, `conv2d` calls MKL, which takes twice as
-    long as oneDNN on an AMD processor. Here oneDNN is called directly.
+    - With gradients, on a CPU without AVX-512, oneDNN takes five times as long for the gradient of
+      the weights as for the convolution itself. This was two thirds of a training step. Here,
+      matrix products compute the gradient instead.
+    - Without gradients, for 1 x 1 kernels, `conv2d` calls MKL if it has one thread. MKL takes twice
+      as long as oneDNN on an AMD processor. Here, oneDNN is called directly.
     """
-    # Under autocast, conv2d chooses the type. An exporter has to see conv2d.
+    # Under autocast, `conv2d` has to choose the type. An exporter has to see `conv2d`.
     is_plain = (
         x.is_cpu
         and x.dtype == weight.dtype == torch.float32
@@ -67,10 +68,14 @@ class _Convolution(torch.autograd.Function):
 def weight_gradient(x: Tensor, grad: Tensor, kernel: Pair, stride: Pair, padding: Pair) -> Tensor:
     """Return the gradient (C', C, kernel height, kernel width) of a convolution's weights.
 
-    A tap is one cell of the kernel. Its gradient is a matrix product of the output's gradient
-    (B, C', H', W') and the part of the input (B, C, H, W) that the tap sees. The product is
-    computed row by row: if the channels are last in memory, a row of pixels is a matrix already,
-    and needs no copy.
+    A tap is one cell of the kernel. Its gradient is the matrix product of the output's gradient and
+    the part of the input that the tap sees. The product is computed row by row: if the channels are
+    last in memory, a row of pixels already is a matrix and needs no copy.
+
+    Args:
+        x: (B, C, H, W), the input.
+        grad: (B, C', H', W'), the gradient of the output.
+        kernel, stride, padding: height and width of each.
     """
     height = (grad.shape[2] - 1) * stride[0] + 1
     width = (grad.shape[3] - 1) * stride[1] + 1

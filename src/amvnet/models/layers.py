@@ -1,4 +1,4 @@
-"""Layers that the two networks share, among them convolutions that wrap around the sensor."""
+"""Define layers that the two networks share, such as convolutions that wrap around the sensor."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from amvnet.models.cpu_convolution import convolve
 class RingConv2d(nn.Conv2d):
     """A convolution over maps whose last axis is the azimuth.
 
-    The azimuth is padded circularly, the other axis with zeros. Input (B, C, H, W), output
-    (B, C', ceil(H / stride), ceil(W / stride)).
+    The azimuth is padded circularly, and the other axis is padded with zeros. The input is
+    (B, C, H, W), and the output is (B, C', ceil(H / stride), ceil(W / stride)).
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class RingConv2d(nn.Conv2d):
         super().__init__(channels, out, kernel, stride, padding=(kernel // 2, 0), bias=False)
         self.strides = stride
         self.wrap = kernel // 2
-        # The kernels that `upsampled_conv` computes, by scale. None while the weight may change.
+        # The kernels that `upsampled_conv` computes, by scale; None while the weight may change.
         self.kernels: dict[tuple[int, int], Tensor] | None = None
 
     def forward(self, input: Tensor) -> Tensor:
@@ -55,9 +55,10 @@ def _pad_width(x: Tensor, left: int, right: int) -> Tensor:
 
 
 class _WrapWidth(torch.autograd.Function):
-    """`_pad_width` with a faster gradient, which adds the pads to the columns they copy in place.
+    """`_pad_width` with a faster gradient.
 
-    The gradient that autograd derives took a third of a training step.
+    In place, it adds the gradients of the pads to the gradients of the columns that they copy. The
+    gradient that autograd derives took a third of a training step.
     """
 
     @staticmethod
@@ -86,13 +87,13 @@ class PointLinear(nn.Linear):
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     """Apply a linear layer with weight (C', C) to rows: (N, C) -> (N, C').
 
-    On a CPU, torch multiplies matrices with MKL, which leaves half or more of an AMD processor's
-    float32 performance unused. oneDNN, which computes convolutions, does not. So without gradients
-    the layer is computed as a 1 x 1 convolution. With gradients it is not, because the gradients of
-    such a convolution are slow.
+    On a CPU, torch multiplies matrices with MKL, which leaves at least half of an AMD processor's
+    float32 performance unused. oneDNN, which computes convolutions, does not. So the layer is
+    computed as a 1 x 1 convolution, but only without gradients: the gradients of such a convolution
+    are slow.
     """
     needs_gradient = torch.is_grad_enabled() and (x.requires_grad or weight.requires_grad)
-    # An exporter would make the number of rows a constant, so it must not see it.
+    # An exporter would make the number of rows a constant, so it must not see the convolution.
     if torch.compiler.is_compiling() or needs_gradient or not x.is_cpu:
         return F.linear(x, weight, bias)
     # A convolution does not take an empty image.
@@ -106,7 +107,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 
 class ConvBlock(nn.Sequential):
-    """Ring convolution, batch norm, leaky ReLU."""
+    """A ring convolution, batch norm and a leaky ReLU: (B, C, H, W) -> (B, C', H', W')."""
 
     def __init__(
         self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)
@@ -132,7 +133,7 @@ class ResidualBlock(nn.Module):
         self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:  # (B, C, H, W) -> (B, C', H / stride, W / stride)
-        # A strided convolution would also subsample. But on a CPU, torch's strided 1 x 1
+        # A strided convolution would subsample as well. But on a CPU, torch's strided 1 x 1
         # convolution over few channels writes out of bounds.
         subsampled = x[..., :: self.stride[0], :: self.stride[1]]
         return F.leaky_relu_(self.second(self.first(x)) + self.skip(subsampled), 0.01)
@@ -147,7 +148,8 @@ class AzimuthGRU(nn.Module):
     these copies are dropped.
 
     Args:
-        padding: share of the columns that are copied.
+        channels: C, number of channels of the map.
+        padding: share of the columns that are copied, 0 to 1.
     """
 
     def __init__(self, channels: int, padding: float) -> None:
@@ -173,10 +175,10 @@ def upsample(x: Tensor, like: Tensor) -> Tensor:
 
 
 def freeze(module: nn.Module) -> None:
-    """Make a module in evaluation mode faster; afterwards its parameters must not change.
+    """Make a module in evaluation mode faster. Its parameters must not change afterwards.
 
-    Batch norms are folded into the layers before them: the outputs are the same up to rounding.
-    Values that depend on parameters alone are computed once.
+    Each batch norm is folded into the layer before it: the outputs are the same up to rounding.
+    Values that depend only on parameters are computed once.
     """
     for layers in list(module.modules()):
         if not isinstance(layers, nn.Sequential):

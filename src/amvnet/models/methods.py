@@ -1,4 +1,4 @@
-"""The methods that label points: one network alone, an ensemble of both, or AMVNet.
+"""Define the methods that label points: one network alone, an ensemble of both, or AMVNet.
 
 This module does not import torch, so that the command line can list the methods quickly.
 """
@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 MethodName = Literal["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 # The floating-point type in which the two networks are computed.
 Precision = Literal["auto", "float32", "bfloat16", "float16"]
-EngineName = Literal["torch", "onnx", "int8"]  # what runs the two networks
-Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]  # f, g: (P, K) -> (P, K)
+EngineName = Literal["torch", "onnx", "int8"]  # name of the engine that runs the two networks
+# Takes the class probabilities f and g (P, K) of the two networks, and returns one (P, K).
+Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]
 
 
 @dataclass(frozen=True)
@@ -40,21 +41,21 @@ class Compute:
 
 ONNX_ENGINES = frozenset({"onnx", "int8"})  # engines that run ONNX Runtime
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
-BOTH_NETWORKS = ("range_net", "polar_net")
+BOTH_NETWORKS = ("range_net", "polar_net")  # names of the two networks' parts in weights
 
 
 def geometric_mean(f: Tensor, g: Tensor) -> Tensor:
-    """Return the geometric mean, which AMVNet uses for certain points."""
+    """Return the geometric mean (P, K), which AMVNet uses for certain points (section 3.3)."""
     return (f * g).sqrt_()
 
 
 def arithmetic_mean(f: Tensor, g: Tensor) -> Tensor:
-    """Return the arithmetic mean, an ensemble to compare with."""
+    """Return the arithmetic mean (P, K), an ensemble to compare with."""
     return (f + g) / 2
 
 
 def maximum(f: Tensor, g: Tensor) -> Tensor:
-    """Return the larger probabilities, an ensemble to compare with."""
+    """Return the larger class probabilities (P, K), an ensemble to compare with."""
     return f.maximum(g)
 
 
@@ -65,8 +66,8 @@ class Method:
     Attributes:
         title: its name in tables and figures.
         parts: the parts of a weights file that the method needs.
-        ensemble: combines the class probabilities f and g of the two networks; None if the method
-            is no ensemble.
+        ensemble: combines the class probabilities f and g of the two networks, or None if the
+            method is no ensemble.
     """
 
     title: str
@@ -79,7 +80,7 @@ class Method:
         return set(BOTH_NETWORKS) <= set(self.parts)
 
 
-# In the order of the paper's tables.
+# All methods by name, in the order of the paper's tables.
 METHODS: dict[str, Method] = {
     "rv": Method("RV", ("range_net",)),
     "rv-knn": Method("RV + kNN", ("range_net",)),
@@ -89,7 +90,8 @@ METHODS: dict[str, Method] = {
     "ensemble": Method("ensemble", BOTH_NETWORKS, geometric_mean),
     "amvnet": Method("AMVNet", (*BOTH_NETWORKS, "point_head")),
 }
-PAPER_METHODS: tuple[MethodName, ...] = ("rv", "bev", "ensemble", "amvnet")  # Tables 3 and 4
+# Methods in the paper's Tables 3 and 4.
+PAPER_METHODS: tuple[MethodName, ...] = ("rv", "bev", "ensemble", "amvnet")
 
 
 def title_of(name: str) -> str:
@@ -98,16 +100,20 @@ def title_of(name: str) -> str:
 
 
 def widest_method(parts: Collection[str]) -> MethodName:
-    """Return the last method of the paper's tables whose parts are all present.
+    """Return the last method of `PAPER_METHODS` whose parts are all present.
 
-    Without any such method this is "amvnet", whose check names the missing parts.
+    If there is none, return "amvnet": `check_method` then names a missing part.
     """
     names = [name for name in PAPER_METHODS if set(METHODS[name].parts) <= set(parts)]
     return names[-1] if names else "amvnet"
 
 
 def check_two_networks(method: MethodName) -> None:
-    """Check that a method knows uncertain points; raise InputError if it has one network."""
+    """Check that a method has two networks, so that it knows uncertain points.
+
+    Raises:
+        InputError: if it has one network.
+    """
     if not METHODS[method].has_two_networks:
         raise InputError(
             f"expected a method of two networks for --uncertain, found {method}; use amvnet"
@@ -115,10 +121,14 @@ def check_two_networks(method: MethodName) -> None:
 
 
 def check_method(method: MethodName, parts: Collection[str]) -> MethodName:
-    """Return the method.
+    """Check a method, and return it.
+
+    Args:
+        method: the name of the method.
+        parts: the parts that the weights have.
 
     Raises:
-        InputError: if there is no such method, or one of the parts that it needs is missing.
+        InputError: if there is no such method, or a part that it needs is missing.
     """
     if method not in METHODS:
         raise InputError(

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
-FREQUENT_TIES = 0.001  # share of queries with a tie above which ties are not due to chance
-LEAF = 32  # points per leaf; with pykdtree's default, 16, trees take longer to build
-AT_ONCE = 2**17  # queries answered at a time, to limit memory: a scan may have millions
+FREQUENT_TIES = 0.001  # largest share of queries with a tie that chance explains
+LEAF_SIZE = 32  # points in a leaf of pykdtree's trees, which take longer to build with fewer
+QUERIES_AT_ONCE = 2**17  # number of queries answered at a time, which limits the memory
 
-# Takes queries (Q, 3). Returns the indices (Q, m) of the m nearest points; and (Q,) bool, whether
+# Takes queries (Q, 3). Returns the indices (Q, m) of the m nearest points, and (Q,) bool: whether
 # another point is as near as the m-th (a tie).
 Query = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -19,16 +19,17 @@ Query = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     """Return (U, n) int32 indices of the n nearest other points of some points of a scan.
 
-    If the scan has fewer than n other points, the farthest is repeated. If it has only one point,
-    the point is its own neighbour.
+    If the scan has fewer than n other points, the farthest of them is repeated. If it has only one
+    point, the point is its own neighbour.
 
     pykdtree takes half of SciPy's time. If ties are frequent, SciPy breaks them, so that labels do
-    not depend on which library is installed. (In the real nuScenes scans at hand, a sixth of the
-    points occur twice.)
+    not depend on the installed library. (In real scans of nuScenes, a sixth of the points occur
+    twice.)
 
     Args:
-        xyz: (P, 3), all points of the scan.
+        xyz: (P, 3), all points of the scan, metres.
         own: (U,) indices of the points whose neighbours are wanted.
+        n: number of neighbours of a point.
     """
     nearest = np.empty((len(own), n), dtype=np.int32)
     if not len(own):
@@ -51,28 +52,36 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
 def _search(
     query: Query, xyz: np.ndarray, own: np.ndarray, rows: np.ndarray, nearest: np.ndarray
 ) -> np.ndarray:
-    """Write some rows of `nearest`, the result of `nearest_others`, in parts of `AT_ONCE` rows.
+    """Write R rows of `nearest`, the result of `nearest_others`, `QUERIES_AT_ONCE` at a time.
 
     Args:
+        query: the search.
+        xyz: (P, 3), all points of the scan, metres.
+        own: (U,) indices of the points whose neighbours are wanted.
         rows: (R,) indices of the rows to write.
+        nearest: (U, n), the result.
 
     Returns:
         (R,) bool, whether the last neighbour of each row has a tie; see `Query`.
     """
     is_tied = np.empty(len(rows), dtype=bool)
-    for start in range(0, len(rows), AT_ONCE):
-        part = rows[start : start + AT_ONCE]
+    for start in range(0, len(rows), QUERIES_AT_ONCE):
+        part = rows[start : start + QUERIES_AT_ONCE]
         indices, ties = query(xyz[own[part]])
         nearest[part] = _drop_self(indices, own[part], nearest.shape[1])
-        is_tied[start : start + AT_ONCE] = ties
+        is_tied[start : start + QUERIES_AT_ONCE] = ties
     return is_tied
 
 
 def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
-    """Return a search for the m nearest of points (P, 3); raise ImportError without pykdtree."""
+    """Return a search for the m nearest of points (P, 3).
+
+    Raises:
+        ImportError: if pykdtree is not installed.
+    """
     from pykdtree.kdtree import KDTree
 
-    tree = KDTree(xyz, leafsize=LEAF)
+    tree = KDTree(xyz, leafsize=LEAF_SIZE)
 
     def query(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # The neighbour after the m-th shows whether the m-th has a tie.
@@ -83,8 +92,8 @@ def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
 
 
 def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
-    """Return a search for the m nearest of points (P, 3) that does not look for ties."""
-    # An unbalanced tree takes a third of the time to build, and a tenth more to query.
+    """Return a search for the m nearest of points (P, 3), which reports no ties."""
+    # An unbalanced tree takes a third of the time to build, and a tenth more time to query.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
 
     def query(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -97,16 +106,17 @@ def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
 def _drop_self(nearest: np.ndarray, index: np.ndarray, n: int) -> np.ndarray:
     """Drop each point itself from its nearest points: (U, m) -> (U, n) indices.
 
-    The nearest points come first. If fewer than n are left, the last one is repeated. If many
-    points coincide, a point may not be among its own nearest points; then the last one is dropped
-    instead.
+    The nearest points come first. If fewer than n are left, the last of them is repeated. If many
+    points coincide, a point may not be among its own nearest points. Then the last of them is
+    dropped instead.
 
     Args:
         nearest: (U, m) indices of the nearest points of each point.
         index: (U,) indices of the points themselves.
+        n: number of neighbours to return.
     """
     if nearest.shape[1] > 1:
-        if (nearest[:, 0] == index).all():  # the usual case: no points coincide
+        if (nearest[:, 0] == index).all():  # usually, no points coincide
             nearest = nearest[:, 1:]
         else:
             is_dropped = nearest == index[:, None]

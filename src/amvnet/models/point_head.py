@@ -1,4 +1,4 @@
-"""The point head classifies uncertain points from their neighbourhood (section 3.3)."""
+"""Classify uncertain points from their neighbourhood: the point head (section 3.3)."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import concatenate, occurring
 from amvnet.runtime.threads import run_parts
 
-POINT_VALUES = 4  # x, y, z, intensity
-LEAST = 1e-24  # lower bound of f * g, so that its logarithm is finite
-PART = 1024  # uncertain points encoded at a time on a CPU, so that they fit into its cache
-PART_ON_GPU = 2**16  # uncertain points encoded at a time on a GPU, enough to keep it busy
-AT_ONCE = 2**17  # uncertain points classified at a time, to limit memory
+POINT_VALUES = 4  # number of a point's own values: x, y, z, intensity
+MIN_PRODUCT = 1e-24  # lower bound of f * g, so that its logarithm is finite
+PART_ON_CPU = 1024  # number of uncertain points encoded at a time on a CPU, which fit its cache
+PART_ON_GPU = 2**16  # number of uncertain points encoded at a time on a GPU, which keep it busy
+POINTS_AT_ONCE = 2**17  # number of uncertain points classified at a time, which limits the memory
 
 
 class PointHead(nn.Module):
     """The network that classifies uncertain points.
 
     Its inputs are p_i (U, 2 K + 4), the features of U uncertain points, and S_i (U, n, 2 K + 4),
-    the rows of the n neighbours of each; `head_features` returns both. Its outputs are logits
-    (U, K). If `config.share` is below 1, the logits in evaluation mode are the weighted geometric
-    mean of the head's own scores and the ensemble of f_i and g_i.
+    one row for each of the n neighbours of each point; `head_features` returns both. Its outputs
+    are logits (U, K). If `config.share` is below 1, the logits in evaluation mode are the weighted
+    geometric mean of the head's own scores and the ensemble of f_i and g_i.
     """
 
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
@@ -69,8 +69,8 @@ class PointHead(nn.Module):
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
         """Return the logits (U, K), as `forward(*head_features(...))` does, but faster.
 
-        The first layer is computed once for each point, not once for each neighbour of each point:
-        W [f_k, g_k, x_k - x_i] = W [f_k, g_k, x_k] - W [0, 0, x_i].
+        The first layer W is linear: W [f_k, g_k, x_k - x_i] = W [f_k, g_k, x_k] - W [0, 0, x_i]. So
+        it is computed once for each point, not once for each neighbour of each point.
 
         Args:
             table: (P, 2 K + 4), the `point_table` of one scan.
@@ -81,7 +81,7 @@ class PointHead(nn.Module):
         rest = self.mlp[1:]
         assert isinstance(first, nn.Linear)
 
-        encoded = first(table)  # (P, hidden[0]): W [f_k, g_k, x_k] of every point
+        encoded = first(table)  # W [f_k, g_k, x_k] of every point, (P, hidden[0])
         point = table.index_select(0, uncertain)
         shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
 
@@ -91,7 +91,7 @@ class PointHead(nn.Module):
             rows = rows.sub_(shift[:, None])  # (part, n, hidden[0])
             return _pool(rest(rows.flatten(0, 1)).unflatten(0, k.shape))
 
-        size = PART if table.is_cpu else PART_ON_GPU
+        size = PART_ON_CPU if table.is_cpu else PART_ON_GPU
         parts = list(zip(near.split(size), shift.split(size), strict=True))
         pooled = run_parts(pool_part, parts) if table.is_cpu else list(map(pool_part, parts))
 
@@ -106,13 +106,13 @@ class PointHead(nn.Module):
             return logits
 
         f, g, _ = point.split([self.classes, self.classes, POINT_VALUES], dim=1)
-        squared_ensemble = (f * g).clamp_min(LEAST)
+        squared_ensemble = (f * g).clamp_min(MIN_PRODUCT)
         return torch.add(share * logits, squared_ensemble.log(), alpha=(1 - share) / 2)
 
 
 def _pool(rows: Tensor) -> Tensor:
     """Apply the last ReLU and return the maximum over the neighbours: (U, n, C) -> (U, C)."""
-    # ReLU is monotonic, so the maximum may come first. Then ReLU has n times less to do.
+    # ReLU is monotonic, so the maximum may come first. ReLU then has one n-th of the work.
     return F.relu(rows.amax(dim=1))
 
 
@@ -124,20 +124,21 @@ def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
 def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
     """Divide some points of a scan into parts by their azimuth.
 
-    Points of similar azimuth share neighbours, so that each part has few points and neighbours.
+    Points of similar azimuth share neighbours, so that the points of a part have few neighbours
+    together.
 
     Args:
         points: (P, 4), all points of the scan.
         index: (U,) indices of the points to divide.
 
     Returns:
-        For each part, the places of its points in `index`; at most `AT_ONCE` of them.
+        For each part, the places of its points in `index`: at most `POINTS_AT_ONCE` places.
     """
-    if len(index) <= AT_ONCE:
+    if len(index) <= POINTS_AT_ONCE:
         return [slice(None)]
 
     azimuth = torch.atan2(points[index, 1], points[index, 0])
-    return list(azimuth.argsort().split(AT_ONCE))
+    return list(azimuth.argsort().split(POINTS_AT_ONCE))
 
 
 def used_points_table(
@@ -145,10 +146,11 @@ def used_points_table(
 ) -> tuple[Tensor, Sequence[Tensor]]:
     """Return the `point_table` of the points whose indices occur in any of the tensors `indices`.
 
-    On a GPU the table has all points. To select some, the CPU would have to wait for their number.
+    On a GPU, the table has all points: to select points, the CPU would have to wait for their
+    number.
 
     Returns:
-        The table, and the tensors `indices` as indices into it.
+        The table, and the tensors `indices` as indices into the table.
     """
     if not points.is_cpu:
         return point_table(points, f, g), indices
@@ -184,6 +186,7 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
     Args:
         points: (P, 4), all points of the scan.
         index: (U,) indices of the points whose neighbours are wanted.
+        n: number of neighbours of a point.
     """
     if points.is_cuda:
         return nearest_others_by_blocks(points[:, :3], index, n)

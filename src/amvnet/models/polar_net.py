@@ -1,4 +1,4 @@
-"""The bird's-eye-view network: PolarNet (Zhang et al., CVPR 2020)."""
+"""Define the bird's-eye-view network: PolarNet (Zhang et al., CVPR 2020)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ from amvnet.models.layers import ConvBlock, PointLinear, linear
 from amvnet.models.upsampled_conv import apply_to_joined
 from amvnet.models.views.polar_view import FEATURES, PolarGrid
 
-PART = 8192  # points encoded at a time on a CPU, so that they fit into its cache
-PART_ON_GPU = 2**18  # points encoded at a time on a GPU, enough to keep it busy
+PART_ON_CPU = 8192  # number of points encoded at a time on a CPU, which fit its cache
+PART_ON_GPU = 2**18  # number of points encoded at a time on a GPU, which keep it busy
 
 
 class PolarNet(nn.Module):
     """The network that takes a `PolarGrid` and returns the logits of its M occupied pillars.
 
-    The logits have the shape (M, Z * K): K for each of the Z voxels of a pillar.
+    The logits are (M, Z * K): K logits for each of the Z voxels of a pillar.
+
+    Args:
+        config: the sizes of the network.
+        vertical: Z, number of voxels in a pillar.
+        classes: K, number of classes.
     """
 
     def __init__(self, config: PolarNetConfig, vertical: int, classes: int) -> None:
@@ -57,7 +62,7 @@ class PolarNet(nn.Module):
     def pool(self, grid: PolarGrid) -> Tensor:  # (F, point_widths[-1])
         if torch.is_grad_enabled():
             return grid.pool(self.point_mlp(grid.features))
-        part = PART if grid.features.is_cpu else PART_ON_GPU
+        part = PART_ON_CPU if grid.features.is_cpu else PART_ON_GPU
         return grid.pool_by_parts(self.point_mlp, part)
 
     def score(self, pillars: Tensor) -> Tensor:  # (M, widths[0]) -> (M, Z * K)
@@ -77,7 +82,12 @@ class PolarNet(nn.Module):
 
 
 class DropBlock(nn.Module):
-    """Drop squares of a map in training, and scale up the remaining cells (Ghiasi et al., 2018)."""
+    """Drop squares of a map in training, and scale up the remaining cells (Ghiasi et al., 2018).
+
+    Args:
+        probability: probability that a cell is dropped.
+        size: side of the squares, cells.
+    """
 
     def __init__(self, probability: float, size: int) -> None:
         super().__init__()
@@ -88,12 +98,12 @@ class DropBlock(nn.Module):
         if not self.training or not self.probability:
             return x
 
-        # The size has to be odd, so that a square has a centre.
+        # A square has a centre if its side is odd.
         size = min(self.size, *x.shape[-2:])
         size -= 1 - size % 2
 
-        # A cell is dropped if a centre falls within the square around it. At this rate, that
-        # happens with the given probability.
+        # A cell is dropped if there is a centre in the square around it. With this rate of centres,
+        # the probability is `self.probability`.
         rate = 1 - (1 - self.probability) ** (1 / size**2)
         centres = torch.rand(x.shape[0], 1, *x.shape[-2:], device=x.device) < rate
         mask = 1 - F.max_pool2d(centres.to(x.dtype), size, stride=1, padding=size // 2)
@@ -108,7 +118,7 @@ def _double(channels: int, out: int) -> nn.Sequential:
 
 
 def _point_mlp(widths: tuple[int, ...]) -> nn.Sequential:
-    """Return the shared MLP. Batch norm follows the input and each layer but the last."""
+    """Return the shared MLP: batch norm follows the input and each layer but the last."""
     layers: list[nn.Module] = [nn.BatchNorm1d(FEATURES)]
     for channels, out in pairwise((FEATURES, *widths[:-1])):
         layers += [PointLinear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]

@@ -1,4 +1,4 @@
-"""The range-view network: a fully convolutional ResNet with recurrent layers (section 3.1)."""
+"""Define the range-view network: a convolutional ResNet with recurrent layers (section 3.1)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,17 @@ from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
 from amvnet.models.upsampled_conv import apply_to_joined
 from amvnet.models.views.range_view import CHANNELS
 
-FIRST_DECODED = 1  # index of the first stage that the decoder uses; its width stride is 4
-RECURRENT = 2  # how many of the last stages are followed by a GRU
+FIRST_DECODED_STAGE = 1  # index of the first stage that the decoder uses; its width stride is 4
+RECURRENT_STAGES = 2  # number of stages, the last ones, that a GRU follows
 
 
 class RangeNet(nn.Module):
-    """The network that takes range images (B, 6, H, W) and returns logits (B, K, H, W)."""
+    """The network that takes range images (B, 6, H, W) and returns logits (B, K, H, W).
+
+    Args:
+        config: the sizes of the network.
+        classes: K, number of classes.
+    """
 
     def __init__(self, config: RangeNetConfig, classes: int) -> None:
         super().__init__()
@@ -28,9 +33,11 @@ class RangeNet(nn.Module):
 
         self.recurrent = nn.ModuleList()
         if c.gru:
-            self.recurrent.extend(AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT:])
+            self.recurrent.extend(
+                AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT_STAGES:]
+            )
 
-        decoded = c.widths[FIRST_DECODED:]
+        decoded = c.widths[FIRST_DECODED_STAGE:]
         self.lateral = nn.ModuleList(ConvBlock(w, c.decoder, 1) for w in decoded)
         self.decoder = nn.ModuleList(ConvBlock(c.decoder, c.decoder) for _ in decoded)
         self.drop = nn.Dropout2d(c.dropout)
@@ -38,21 +45,24 @@ class RangeNet(nn.Module):
         self.scores = nn.Conv2d(c.head, classes, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        # At 20 m, bfloat16 resolves a coordinate to 0.1 m only. This is too coarse to tell a hedge
+        # At 20 m, bfloat16 resolves a coordinate only to 0.1 m, which is too coarse to tell a hedge
         # from a wall.
         with torch.autocast(image.device.type, enabled=False):
             full = self.stem(self.input_norm(image))
 
         full = self.stem_blocks(full)  # (B, stem, H, W)
         maps = self.encode(full)
-        decoded = self.decode(maps[FIRST_DECODED:])  # (B, decoder, H, W / 4)
+        decoded = self.decode(maps[FIRST_DECODED_STAGE:])  # (B, decoder, H, W / 4)
         x = apply_to_joined(self.last, decoded, full)
         return convolve(x, self.scores.weight, self.scores.bias, stride=(1, 1), padding=(0, 0))
 
     def encode(self, x: Tensor) -> list[Tensor]:
-        """Return the maps of all stages, with width strides 2, 4, 8, ...
+        """Return the maps of all stages, whose width strides are 2, 4, 8, ...
 
-        The last `RECURRENT` maps are the outputs of the GRUs.
+        The last `RECURRENT_STAGES` maps are the outputs of the GRUs.
+
+        Args:
+            x: (B, stem, H, W), the map at full resolution.
         """
         maps = []
         first_recurrent = len(self.stages) - len(self.recurrent)
@@ -65,7 +75,10 @@ class RangeNet(nn.Module):
         return maps
 
     def decode(self, maps: list[Tensor]) -> Tensor:
-        """Go from the coarsest map to the finest: upsample, add the lateral map, and convolve."""
+        """Go from the coarsest map to the finest: upsample, add the lateral map, and convolve.
+
+        Return the finest decoded map, (B, decoder, h, w).
+        """
         decoded: Tensor | None = None
         for x, lateral, conv in reversed(list(zip(maps, self.lateral, self.decoder, strict=True))):
             side = lateral(x)

@@ -1,4 +1,4 @@
-"""A fast convolution over an upsampled map concatenated with a fine map."""
+"""Convolve an upsampled map that is concatenated with a fine map, in half of the time."""
 
 from __future__ import annotations
 
@@ -20,14 +20,16 @@ def apply_to_joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
 def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Tensor:
     """Convolve `torch.cat([upsample(coarse, fine), fine], dim=1)` with 3 x 3 kernels.
 
-    A convolution is linear, so that each map can be convolved alone and the results added.
+    A convolution is linear, so that each map is convolved alone and the results are added.
     Upsampling repeats each value s times along an axis. So the 3 taps of a kernel see at most 2
-    different values, and 2 taps with summed weights on the coarse map do the same. Which weights
-    are summed depends on the position of the fine cell within its coarse cell, so that there are s
-    kernels. This is half of the work.
+    different values, and 2 taps with summed weights on the coarse map give the same result. The
+    position of a fine cell within its coarse cell decides which weights are summed, so that there
+    are s kernels. This is half of the work.
 
     Args:
-        coarse: (B, C, h, w). If H is not a multiple of h, or W of w, the map is really upsampled.
+        convolution: the convolution, over C + C' channels.
+        coarse: (B, C, h, w). It is really upsampled if H is not a multiple of h, or W is not a
+            multiple of w.
         fine: (B, C', H, W).
     """
     scale = (fine.shape[2] // coarse.shape[2], fine.shape[3] // coarse.shape[3])
@@ -47,7 +49,7 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
 def _kernels(convolution: RingConv2d, weight: Tensor, scale: tuple[int, int]) -> Tensor:
     """Return the kernels for a coarse map: weight (C', C, 3, 3) -> (s * s * C', C, taps, taps).
 
-    A frozen convolution keeps its kernels. An exporter has to see how they are computed.
+    A frozen convolution keeps its kernels. An exporter has to see the computation of the kernels.
     """
     may_keep = not torch.is_grad_enabled() and not torch.compiler.is_compiling()
     kept = convolution.kernels if may_keep else None
@@ -66,19 +68,21 @@ def _kernels(convolution: RingConv2d, weight: Tensor, scale: tuple[int, int]) ->
 def _convolve_upsampled(x: Tensor, kernels: Tensor, scale: tuple[int, int]) -> Tensor:
     """Convolve a coarse map as if it were upsampled: (B, C, h, w) -> (B, C', h * scale, w * scale).
 
-    The width is continued circularly. Fine cell s * t + p, with p from -1 to s - 2, sees the coarse
-    cells t - 1 and t. So there is one kernel of 2 taps for each p. Because p begins at -1, the row
-    of results begins one fine cell before the map.
+    The width is padded circularly. The fine cell s * t + p, with p from -1 to s - 2, sees the
+    coarse cells t - 1 and t. So there is one kernel of 2 taps for each p. Because p begins at -1,
+    the row of results begins one fine cell before the map.
 
     Args:
-        kernels: as `_kernels` returns them for `scale`.
+        x: (B, C, h, w), the coarse map.
+        kernels: the kernels that `_kernels` returns for `scale`.
+        scale: s along the height and along the width.
     """
     rows, columns = scale
     output = convolve(wrap_width(x, 1, 1), kernels, None, stride=(1, 1), padding=(1, 0))
     output = output.permute(0, 2, 3, 1)  # (B, h + 1, w + 1, s * s * C')
     b, h, w, _ = output.shape
 
-    # Lay the s * s outputs of each coarse cell out as fine cells.
+    # Arrange the s * s outputs of each coarse cell as fine cells.
     cells: Tensor = output.unflatten(3, (rows, columns, -1)).transpose(2, 3)
     cells = cells.reshape(b, h * rows, w * columns, -1)
 
@@ -91,10 +95,10 @@ def _convolve_upsampled(x: Tensor, kernels: Tensor, scale: tuple[int, int]) -> T
 
 
 def _taps(scale: int, like: Tensor) -> Tensor:
-    """Return (scale, taps, 3): 1 where a weight is part of a tap's sum, else 0.
+    """Return which weights each tap sums: (scale, taps, 3), 1 for a weight in the sum, else 0.
 
-    The first axis is the position of a fine cell within its coarse cell, the second the taps on
-    the coarse map, the third the 3 weights.
+    The first axis is the position of a fine cell within its coarse cell. The second axis is the tap
+    on the coarse map. The third axis is the weight.
     """
     if scale == 1:
         return torch.eye(3, dtype=like.dtype, device=like.device)[None]

@@ -1,7 +1,7 @@
 """Label points by a vote of their neighbours in the range image (RangeNet++, Milioto et al. 2019).
 
-A pixel has one label, which suits its nearest point. But the pixel may also hold points behind that
-one. The vote gives them the labels of points at their own distance.
+A pixel has one label, which suits its nearest point. But there may be points behind that point in
+the same pixel. The vote gives them the labels of points at their own distance.
 """
 
 from __future__ import annotations
@@ -12,26 +12,31 @@ from torch import Tensor
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeImage
 
-# These numbers are RangeNet++'s.
-NEIGHBOURS = 5  # points that vote on a point's label, including the point itself
-WINDOW = 5  # height and width of the window around the point's pixel; odd
+# These are the numbers of RangeNet++.
+NEIGHBOURS = 5  # number of points that vote on a point's label, including the point itself
+WINDOW = 5  # height and width of the window around the point's pixel, pixels; odd
 SIGMA = 1.0  # standard deviation of the Gaussian over the window, pixels
 CUTOFF = 1.0  # largest weighted difference of range with which a point votes, metres
 
 
 def vote(f: Tensor, batch: PointBatch, image: RangeImage) -> Tensor:
-    """Return each class's share of the votes on each point, (P, K), given f (P, K).
+    """Return the share of each class in the votes on each point: (P, K).
 
     The candidates are the point itself and the nearest point of each other pixel in the window. At
-    the left and right borders the window continues at the other end of the image. The `NEIGHBOURS`
-    candidates with the least difference of range, weighted by `window_weights`, vote. If two
+    the left and right borders, the window continues at the other end of the image. The
+    `NEIGHBOURS` candidates whose range differs least, weighted by `window_weights`, vote. If two
     classes have equally many votes, the class with the nearest voter has the larger share.
+
+    Args:
+        f: (P, K) class probabilities of the points by the range view's network.
+        batch: the points.
+        image: the range images of the batch.
     """
     distance = batch.points[:, :3].norm(dim=1)
     pixels, is_outside = _windows(image)
     own = WINDOW**2 // 2  # the place of the point itself in its window
 
-    # (P, S * S): differences of range between each point and the points of its window
+    # The differences of range between each point and the points of its window, (P, S * S).
     ranges = torch.where(image.nearest < 0, torch.inf, distance[image.nearest])
     difference = (ranges[pixels] - distance[:, None]).abs_().mul_(window_weights().to(distance))
     difference[is_outside] = torch.inf
@@ -42,7 +47,7 @@ def vote(f: Tensor, batch: PointBatch, image: RangeImage) -> Tensor:
     itself = torch.arange(len(f), device=f.device)[:, None]
     ballots = f.argmax(dim=1)[torch.where(place == own, itself, voter)]
 
-    # Nearer voters count a little more, so that there are no ties. All these additions together
+    # Nearer voters count a little more, so that there are no ties. All these extra weights together
     # are less than one vote.
     rank = torch.arange(1, NEIGHBOURS + 1, device=f.device)
     weights = (difference <= CUTOFF) * (1 + 0.5**rank)
@@ -51,7 +56,7 @@ def vote(f: Tensor, batch: PointBatch, image: RangeImage) -> Tensor:
 
 
 def window_weights() -> Tensor:
-    """Return the weights (S * S,) of the window's pixels: 1 minus a Gaussian whose sum is 1."""
+    """Return the weights (S * S,) of the window's pixels: 1 minus a Gaussian that sums to 1."""
     offsets = torch.arange(WINDOW) - WINDOW // 2
     squares = offsets[:, None] ** 2 + offsets**2
     gaussian = torch.exp(-squares / (2 * SIGMA**2))
@@ -62,12 +67,12 @@ def _windows(image: RangeImage) -> tuple[Tensor, Tensor]:
     """Return the pixels around each point's pixel, row by row.
 
     Returns:
-        (P, S * S) indices into the B * H * W pixels of the batch; and (P, S * S) bool, True for
-        pixels that would lie above or below the point's image, and do not count.
+        (P, S * S) indices into the B * H * W pixels of the batch; and (P, S * S) bool: whether the
+        pixel would lie above or below the point's image, so that it does not count.
     """
     _, _, height, width = image.image.shape
     offsets = torch.arange(WINDOW, device=image.pixel.device) - WINDOW // 2
-    rows = (image.pixel // width)[:, None] + offsets  # (P, S), of all images
+    rows = (image.pixel // width)[:, None] + offsets  # rows counted over all images, (P, S)
     columns = ((image.pixel % width)[:, None] + offsets) % width
     is_outside = rows // height != (image.pixel // (width * height))[:, None]
 

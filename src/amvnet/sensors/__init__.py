@@ -1,1 +1,1 @@
-"""LiDAR sensors: known ones, measured ones, and scans normalised to the weights."""
+"""Describe and measure LiDAR sensors, and normalise their scans for the weights."""

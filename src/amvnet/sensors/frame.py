@@ -13,32 +13,34 @@ from amvnet.errors import InputError
 from amvnet.sensors.ground import Ground, find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
 
-# The median distance of the points tells the unit: with all sensors it is 2 to 40 metres.
-FARTHEST_MEDIAN = 200.0  # largest median distance for which the unit is metres
-MIN_MILLIMETRES = 4000.0  # above it, millimetres; between the two, centimetres or millimetres
-# The origin is near the sensor if the 5 % quantile of the distances is less than this share of the
-# 95 % quantile.
-AROUND = 0.5
+# The median distance of the points tells the unit. For all sensors it is 2 to 40 metres.
+MAX_METRES_MEDIAN = 200.0  # largest median distance of coordinates in metres
+# Smallest median distance of coordinates that must be millimetres. A median between the two limits
+# may be in centimetres or millimetres.
+MIN_MILLIMETRES_MEDIAN = 4000.0
+# Largest ratio of the 5 % quantile of the distances to the 95 % quantile with which the origin is
+# near the sensor.
+AROUND_SHARE = 0.5
 
-UP_AXES = ("z-down", "z-forward", "y-up")  # axes to try if no ground is found below
-SAME_TILT = 3.5  # largest tilt that is not levelled, degrees; the datasets' roads slope by 3.1
-STEADY_TILT = 3.0  # degrees; if tilts in a recording differ by more, each scan gets its own
-SAME_HEIGHT = 0.15  # largest difference of height that is not corrected, metres; training varies it
-LOWEST = 0.3  # metres; if the origin is lower, it lies on the ground and not at the sensor
+UP_AXES = ("z-down", "z-forward", "y-up")  # axes to try if there is no ground below the sensor
+SAME_TILT = 3.5  # largest tilt that is not levelled, degrees; roads of the datasets slope by 3.1
+STEADY_TILT = 3.0  # limit of the differences of tilt in a recording with one frame, degrees
+SAME_HEIGHT = 0.15  # limit of the differences of height that stay, metres; training varies it
+ON_GROUND_HEIGHT = 0.3  # limit of the height of an origin that lies on the ground, metres
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What was found out about the frame of a file, as far as the user did not describe it.
+    """The frame of a file, as far as it was found and not described by the user.
 
     Attributes:
         unit: the unit of the coordinates, a name in `UNITS`.
         axes: the directions of the axes, a name in `AXES`.
-        pitch, roll: degrees by which to turn the scan level after its axes became the package's; 0
-            if the scan is level enough, or the user described the rotation.
-        height: height of the origin over the ground in the level scan, metres; None if no ground
-            was found.
-        tilt: tilt of the ground before the scan is turned level, degrees; messages state it.
+        pitch, roll: rotation that levels the scan in the package's axes, degrees; 0 if the scan is
+            level enough or the user described the rotation.
+        height: height of the origin over the ground in the level scan, metres, or None if there is
+            no ground.
+        tilt: tilt of the ground before the scan is levelled, degrees; messages state it.
     """
 
     unit: str = "m"
@@ -49,7 +51,7 @@ class Frame:
     tilt: float = 0.0
 
     def complete(self, sensor: Sensor) -> Sensor:
-        """Return the sensor with this frame where the user did not describe it.
+        """Return the sensor; this frame completes what the user did not describe.
 
         Pitch and roll turn the scan about the sensor.
         """
@@ -67,20 +69,20 @@ class Frame:
 
     def is_on_ground(self, sensor: Sensor) -> bool:
         """Return whether the origin of the coordinates lies on the ground or below it."""
-        may_be_higher = sensor.height is None or sensor.height >= LOWEST
-        return self.height is not None and self.height < LOWEST and may_be_higher
+        may_be_higher = sensor.height is None or sensor.height >= ON_GROUND_HEIGHT
+        return self.height is not None and self.height < ON_GROUND_HEIGHT and may_be_higher
 
     def rises(self, sensor: Sensor, usual_height: float | None) -> tuple[float, float]:
         """Return how far to move a scan up, metres.
 
         Args:
             sensor: what is known about the sensor.
-            usual_height: height over the ground of the sensor that the weights know, metres; None
-                if unknown. A sensor of unknown height that is not at the origin is assumed to have
-                this height.
+            usual_height: height over the ground of the sensor that the weights know, metres, or
+                None if it is unknown. If the origin lies on the ground and the height of the sensor
+                is unknown, the sensor is assumed to have this height.
 
         Returns:
-            The rise that brings the sensor to the origin, and the rise that brings the ground
+            The rise that brings the sensor to the origin, and the rise that brings the ground to
             `usual_height` below the origin.
         """
         known = sensor.height
@@ -103,7 +105,7 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
 
     Args:
         xyz: (N, 3) finite coordinates of the file, without lost points.
-        sensor: what the user described; only the rest is guessed.
+        sensor: what the user described; only the rest is estimated.
 
     Raises:
         InputError: if the user did not give the unit, and the coordinates are clearly neither
@@ -130,16 +132,20 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
 
 
 def _find_unit(xyz: np.ndarray) -> str:
-    """Tell metres from millimetres by the distances of points (N, 3)."""
+    """Return the unit, "m" or "mm", by the distances of points (N, 3).
+
+    Raises:
+        InputError: if the distances are clearly neither metres nor millimetres.
+    """
     if not len(xyz):
         return "m"
     distances = np.linalg.norm(xyz.astype(np.float64), axis=1)
     near, median, far = np.quantile(distances, (0.05, 0.5, 0.95))
 
     # Points far from the origin are map coordinates, which `check_usable` refuses.
-    if not median > FARTHEST_MEDIAN or near > AROUND * far:
+    if not median > MAX_METRES_MEDIAN or near > AROUND_SHARE * far:
         return "m"
-    if median > MIN_MILLIMETRES:
+    if median > MIN_MILLIMETRES_MEDIAN:
         return "mm"
     raise InputError(
         f"expected metres from the sensor, found half of the points farther than {median:.0f}; "
@@ -148,10 +154,10 @@ def _find_unit(xyz: np.ndarray) -> str:
 
 
 def _find_axes(xyz: np.ndarray) -> str:
-    """Return the only one of `UP_AXES` with which the points (N, 3) have a sure ground.
+    """Return the name in `UP_AXES` with which the points (N, 3) have a sure ground.
 
-    If several have one, return "x-forward". This happens in a corridor, whose walls look like a
-    ground.
+    Return "x-forward" if there is no such name or more than one. The walls of a corridor, for
+    example, look like the ground.
     """
     sure = []
     for axes in UP_AXES:
@@ -164,7 +170,7 @@ def _find_axes(xyz: np.ndarray) -> str:
 def _level(frame: Frame, level: np.ndarray, ground: Ground) -> Frame:
     """Return the frame with the rotation that levels a tilted scan.
 
-    The ground is then searched for again, because the cells of the level scan have other lowest
+    The ground is found a second time, because the cells of the levelled scan have other lowest
     points.
     """
     turn = rotation_from_degrees(0, *_levelling(ground.up))
@@ -183,7 +189,10 @@ def _levelling(up: np.ndarray) -> tuple[float, float]:
 
 
 def median_frame(frames: Sequence[Frame]) -> Frame:
-    """Return the frame of a recording, given the frames of its first scans."""
+    """Return the frame of a recording from the frames of its first scans.
+
+    Unit and axes are the most frequent ones; angles and height are medians.
+    """
     unit = mode(frame.unit for frame in frames)
     axes = mode(frame.axes for frame in frames)
     alike = [frame for frame in frames if (frame.unit, frame.axes) == (unit, axes)]

@@ -7,30 +7,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-MIN_DISTANCE = 1.0  # metres; nearer returns are from the vehicle itself
-CELL = 1.0  # side of the cells whose lowest points are used, metres
-RADIUS = 20.0  # metres; farther points are not used
+MIN_DISTANCE = 1.0  # smallest distance of points that are used, metres; the vehicle is nearer
+CELL_SIDE = 1.0  # side of the cells whose lowest points are used, metres
+MAX_DISTANCE = 20.0  # largest distance of points that are used, metres
 HALF_WEIGHT = 8.0  # distance at which a cell counts half as much as at the sensor, metres
-TRIES = 400  # number of planes that are tried, each through three low points
-MIN_AREA = 1.0  # least double area of the triangle between the three points, square metres
+TRIED_PLANES = 400  # number of planes that are tried, each through three low points
+MIN_AREA = 1.0  # smallest double area of the triangle between the three points, square metres
 TOLERANCE = 0.1  # largest distance of the ground's points from the plane, metres
-MAX_SLOPE = 25.0  # degrees; steeper planes are walls and embankments
-MIN_CELLS = 30  # least number of cells with points
-MIN_AGREEMENT = 0.25  # least weighted share of the cells that lie in the plane
+MAX_SLOPE = 25.0  # largest slope of the ground, degrees: steeper planes are walls and embankments
+MIN_CELLS = 30  # smallest number of cells with points
+MIN_AGREEMENT = 0.25  # smallest weighted share of the cells that lie in the plane
 
 # Which side of the plane is up? The ground has things above it, and little below it.
-OFF_PLANE = 0.3  # distance within which points at the sensor belong to the plane, metres
-CURVED = 0.02  # what is added to this distance for each metre from the sensor, metres
-MAX_BELOW = 0.1  # largest share of the points below the plane, unless more are above it
-MIN_HEIGHT = -0.5  # height of the origin over the plane, metres; if lower, the plane must be sure
-MAX_HEIGHT = 10.0  # height of the origin over the plane, metres; if higher, the plane is a wall
+MAX_OFF_PLANE = 0.3  # largest distance from the plane of points that belong to it, metres
+OFF_PLANE_PER_METRE = 0.02  # increase of this distance for each metre from the sensor, metres
+MAX_BELOW = 0.1  # largest share of the points below the plane, unless more points are above it
+MIN_HEIGHT = -0.5  # smallest height of the origin over a plane that need not be sure, metres
+MAX_HEIGHT = 10.0  # largest height of the origin over the plane, metres: lower planes are no ground
 
 # When is a plane sure enough to turn a scan by it? In real scans in all orientations, the ground
 # has 0.3 to 0.7 of the points within `TOLERANCE` and 0.4 to 0.8 of the cells. A wall has at most
-# 0.15.
-SURE_AGREEMENT = 0.3  # least weighted share of the cells
-SURE_CELLS = 40  # least area of the cells, weighted by their distance, square metres
-SURE_SHARE = 0.2  # least share of the points within `RADIUS` that lie in the plane
+# 0.15 of the points.
+SURE_AGREEMENT = 0.3  # smallest weighted share of the cells
+SURE_CELLS = 40  # smallest area of the cells, weighted by their distance, square metres
+SURE_SHARE = 0.2  # smallest share of the points within `MAX_DISTANCE` that lie in the plane
 
 
 @dataclass(frozen=True)
@@ -49,21 +49,24 @@ class Ground:
 
     @property
     def tilt(self) -> float:
-        """Degrees between the normal and the z axis."""
+        """Angle between the normal and the z axis, degrees."""
         return float(np.degrees(np.arccos(np.clip(self.up[2], -1, 1))))
 
 
 def find_ground(xyz: NDArray[np.floating]) -> Ground | None:
-    """Find the ground of a scan whose z axis points more or less up; None if there is none.
+    """Find the ground of a scan whose z axis points more or less up.
 
-    Of many planes through three low points, the ground is the plane with many low points in it and
-    few below it. Least squares refine it. Near points count more.
+    Many planes through three low points are tried. The ground is the plane with many low points in
+    it and few below it. Least squares refine it. Near points count more.
 
     Args:
         xyz: (N, 3) finite points, metres.
+
+    Returns:
+        The ground, or None if no plane is good enough.
     """
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
-    around = xyz[(distance > MIN_DISTANCE) & (distance < RADIUS)]
+    around = xyz[(distance > MIN_DISTANCE) & (distance < MAX_DISTANCE)]
     low = _lowest_points(around)
     if len(low) < MIN_CELLS:
         return None
@@ -104,19 +107,20 @@ def find_ground(xyz: NDArray[np.floating]) -> Ground | None:
 
 
 def _sides(xyz: NDArray[np.floating], plane: NDArray[np.floating]) -> tuple[float, float]:
-    """Return the share of the points (N, 3) that are clearly above a plane, and clearly below it.
+    """Return two shares of the points (N, 3): clearly above a plane, and clearly below it.
 
-    Far points count as well: next to a raised road, more near points may be below it than above.
+    Far points count as well: next to a raised road, more near points may be below the plane than
+    above it.
     """
     off_plane = xyz[:, 2] - _with_ones(xyz) @ plane
-    least = OFF_PLANE + CURVED * np.hypot(xyz[:, 0], xyz[:, 1])
+    least = MAX_OFF_PLANE + OFF_PLANE_PER_METRE * np.hypot(xyz[:, 0], xyz[:, 1])
     return float(np.mean(off_plane > least)), float(np.mean(off_plane < -least))
 
 
 def _lowest_points(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the lowest point of each cell around the sensor, (M, 3)."""
-    column, row = np.floor((xyz[:, :2] + RADIUS) / CELL).astype(np.int64).T
-    cell = column * int(2 * RADIUS / CELL + 1) + row
+    """Return the lowest point of each of the M cells that have points: (M, 3)."""
+    column, row = np.floor((xyz[:, :2] + MAX_DISTANCE) / CELL_SIDE).astype(np.int64).T
+    cell = column * int(2 * MAX_DISTANCE / CELL_SIDE + 1) + row
 
     order = np.lexsort((xyz[:, 2], cell))
     is_first = np.diff(cell[order], prepend=-1) > 0
@@ -127,14 +131,14 @@ def _lowest_points(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
 def _best_plane(
     low: NDArray[np.floating], weight: NDArray[np.floating]
 ) -> NDArray[np.floating] | None:
-    """Return (a, b, c) of the plane z = a x + b y + c that most low points (M, 3) agree with.
+    """Return (a, b, c) of the plane z = a x + b y + c through most of the low points (M, 3).
 
     Return None if every plane is too steep. The random draws are seeded, so that the same points
     give the same plane.
     """
     rng = np.random.default_rng(0)
-    triples = low[rng.choice(len(low), (TRIES, 3), p=weight / weight.sum())]  # (tries, 3, 3)
-    corners = np.concatenate([triples[:, :, :2], np.ones((TRIES, 3, 1))], axis=2)
+    triples = low[rng.choice(len(low), (TRIED_PLANES, 3), p=weight / weight.sum())]  # (tries, 3, 3)
+    corners = np.concatenate([triples[:, :, :2], np.ones((TRIED_PLANES, 3, 1))], axis=2)
     is_large = np.abs(np.linalg.det(corners)) > MIN_AREA
     planes = np.linalg.solve(corners[is_large], triples[is_large][:, :, 2:])[:, :, 0]
 
@@ -151,5 +155,5 @@ def _best_plane(
 
 
 def _with_ones(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return rows x, y, 1, (M, 3). Their product with (a, b, c) is the height of the plane."""
+    """Return the rows (x, y, 1): (M, 3). Their product with (a, b, c) is the plane's height."""
     return np.column_stack([xyz[:, :2], np.ones(len(xyz))])

@@ -1,7 +1,7 @@
 """Bring intensities to the range and the distribution that some weights know.
 
-Sensors and tools write intensities as fractions, in 8 bits or in 16 bits, calibrated or not. All
-decisions rest on quantiles, so that a few outliers change nothing.
+Sensors and tools write intensities as fractions or as integers of 8 or 16 bits. Some calibrate
+them. All decisions rest on quantiles, so that a few outliers change nothing.
 """
 
 from __future__ import annotations
@@ -18,26 +18,29 @@ from amvnet.errors import InputError, shown
 from amvnet.scan import Scan
 
 # The quantiles at these probabilities describe a distribution of intensities. They leave out a
-# thousandth at both ends: outliers, and the few retroreflectors that decide the maximum of a scan.
+# thousandth at each end: outliers, and the few retroreflectors that decide the maximum of a scan.
 PROBABILITIES = (0.001, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999)
-MEDIAN = PROBABILITIES.index(0.5)
-BRIGHT = PROBABILITIES.index(0.9)
-DARKEST = 0.004  # one step of 8 bits; factors between darker intensities mean nothing
-# The largest factor between the medians, and between the bright quantiles, ...
-ALIKE = 2.0  # ... of two distributions that are alike
-ONE_RANGE = 8.0  # ... of two scans whose intensities have the same range
-CONSTANT = 0.01  # share of the median; if 98 % of the intensities differ by less, they say nothing
-BLIND_SHARE = 0.2  # networks that saw this share of their scans without intensity need none
+MEDIAN_INDEX = PROBABILITIES.index(0.5)  # index of the median among the quantiles
+BRIGHT_INDEX = PROBABILITIES.index(0.9)  # index of the bright quantile
+DARKEST_INTENSITY = 0.004  # one step of 8 bits: factors between darker intensities mean nothing
+# Largest factor between the medians, and between the bright quantiles, of two like distributions.
+ALIKE_FACTOR = 2.0
+# Largest such factor of two scans whose intensities have one range.
+ONE_RANGE_FACTOR = 8.0
+# Intensities are constant if 98 % of them differ by at most this share of their median.
+CONSTANT_SHARE = 0.01
+# Networks need no intensity if they were trained with this share of their scans without it.
+BLIND_SHARE = 0.2
 
 # Quantiles of the intensities in simulated training scans. Weights without quantiles of their own
 # use these.
-QUANTILES = {
+SIMULATED_QUANTILES = {
     "hdl64e": (0.0, 0.0, 0.07, 0.133, 0.232, 0.311, 0.396, 0.492, 0.565, 0.755, 0.986),
     "hdl32e": (0.0, 0.0, 0.005, 0.007, 0.011, 0.039, 0.066, 0.11, 0.17, 0.265, 0.792),
 }
-LARGEST_INTENSITY = 1e9  # no device writes larger intensities
-KEY = "intensity_quantiles"  # key of the quantiles in a part's training record
-MATCHED = "match_intensity"  # key of `TrainedIntensity.is_matched` in a part's training record
+MAX_INTENSITY = 1e9  # limit of a quantile in a file; no device writes larger intensities
+QUANTILES_KEY = "intensity_quantiles"  # key of the quantiles in a part's training record
+MATCHED_KEY = "match_intensity"  # key of `TrainedIntensity.is_matched` in a part's training record
 NO_INTENSITY = [0.0] * len(PROBABILITIES)  # the quantiles of training scans without intensities
 
 
@@ -60,7 +63,7 @@ class TrainedIntensity:
     def are_fractions(self) -> bool:
         """Whether the intensities lie in [0, 1].
 
-        If not, the networks were trained with other intensities and take such intensities.
+        If not, the networks were trained with a larger range and take intensities in that range.
         """
         return self.quantiles[-1] <= 1
 
@@ -68,7 +71,7 @@ class TrainedIntensity:
         """Return (count,) float32 intensities for a scan that has none.
 
         Networks that learnt to do without intensities get zeros. Other networks would take a
-        constant for a material. They get seeded random draws from the training's distribution.
+        constant for a material, so they get seeded random draws from the training's distribution.
         """
         if self.is_optional:
             return np.zeros(count, np.float32)
@@ -85,18 +88,21 @@ def network_records(training: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[
 
 
 def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntensity | None:
-    """Return the intensities that weights were trained with; None if they are unknown.
+    """Return the intensities that weights were trained with, or None if these are unknown.
 
     Args:
         training: the training records of the weights by part.
         sensor: name of the sensor that the weights were trained for.
+
+    Raises:
+        InputError: if a record has wrong quantiles.
     """
-    quantiles: Sequence[float] | None = QUANTILES.get(sensor)
+    quantiles: Sequence[float] | None = SIMULATED_QUANTILES.get(sensor)
     shares = []
     matched = []
     for part, record in network_records(training):
-        carried = record.get(KEY)
-        if carried == NO_INTENSITY and record.get(MATCHED) is not True:
+        carried = record.get(QUANTILES_KEY)
+        if carried == NO_INTENSITY and record.get(MATCHED_KEY) is not True:
             quantiles = NO_INTENSITY
         elif carried:
             quantiles = check_quantiles(carried, f"the training record of {part}")
@@ -104,7 +110,7 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
         augment = record.get("augment")
         share = augment.get("no_intensity") if isinstance(augment, Mapping) else None
         shares.append(share if isinstance(share, (int, float)) else 0)
-        matched.append(record.get(MATCHED) is True)
+        matched.append(record.get(MATCHED_KEY) is True)
 
     if quantiles is None:
         return None
@@ -115,10 +121,10 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
     )
 
 
-def prepare(scan: Scan, trained: TrainedIntensity | None) -> Scan:
+def adapt_intensity(scan: Scan, trained: TrainedIntensity | None) -> Scan:
     """Return a scan with the intensities that the networks take.
 
-    Everything that segments scans calls this.
+    Everything that segments scans calls this function.
 
     Raises:
         InputError: if `check_intensity` raises it.
@@ -130,14 +136,14 @@ def prepare(scan: Scan, trained: TrainedIntensity | None) -> Scan:
 
 def simulated_intensity(sensor: str) -> TrainedIntensity:
     """Return the intensities to which the scans of a simulated sensor are brought in training."""
-    return TrainedIntensity(QUANTILES[sensor], is_matched=True)
+    return TrainedIntensity(SIMULATED_QUANTILES[sensor], is_matched=True)
 
 
 def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
-    """Return a scan with its intensities brought to the distribution of a training.
+    """Return a scan whose intensities have the distribution of a training.
 
-    The scan is returned unchanged if the training does not ask for this
-    (`TrainedIntensity.is_matched`), or if its intensities say nothing, such as zeros everywhere.
+    The scan is returned unchanged if the training does not need this
+    (`TrainedIntensity.is_matched`), or if its intensities are constant.
     """
     if trained is None or not trained.is_matched:
         return scan
@@ -155,10 +161,17 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
 
 
 def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct quantiles of some scans, and the intensities that they become.
+    """Return the Q distinct quantiles of some scans, and the intensities that they become.
 
-    Intensities between two quantiles are interpolated linearly. If quantiles are equal, as with
-    many zeros, they become the mean of the training's quantiles at their probabilities.
+    Linear interpolation maps the intensities between two quantiles. Equal quantiles, of many zeros
+    for example, become the mean of the training's quantiles at their probabilities.
+
+    Args:
+        quantiles: the quantiles of the scans at `PROBABILITIES`, ascending.
+        trained: the quantiles of the training at `PROBABILITIES`.
+
+    Returns:
+        (Q,) distinct quantiles, ascending, and (Q,) intensities in [0, 1].
     """
     levels, index = np.unique(quantiles, return_inverse=True)
     becomes = np.bincount(index, weights=trained) / np.bincount(index)
@@ -166,18 +179,26 @@ def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarra
 
 
 def are_quantiles(values: Any) -> TypeGuard[list[float]]:
-    """Return whether a value of a file is quantiles at `PROBABILITIES` that are not all equal."""
+    """Return whether a value of a file is a list of quantiles at `PROBABILITIES`, not constant."""
     if not isinstance(values, list) or len(values) != len(PROBABILITIES):
         return False
     are_numbers = all(type(value) in (int, float) for value in values)
-    if not are_numbers or not all(0 <= value < LARGEST_INTENSITY for value in values):
-        return False  # also for NaN
+    if not are_numbers or not all(0 <= value < MAX_INTENSITY for value in values):
+        return False  # NaN fails this check as well
     is_increasing = bool((np.diff(values) >= 0).all())
     return is_increasing and not is_constant(values)
 
 
 def check_quantiles(values: Any, source: str) -> list[float]:
-    """Return the quantiles in a file; raise InputError if they are wrong."""
+    """Return the quantiles in a file, after a check.
+
+    Args:
+        values: the value in the file.
+        source: where it stands, for the message.
+
+    Raises:
+        InputError: if `are_quantiles` is false.
+    """
     if not are_quantiles(values):
         raise InputError(
             f"{source}: expected {len(PROBABILITIES)} quantiles of the intensities, ascending and "
@@ -187,9 +208,9 @@ def check_quantiles(values: Any, source: str) -> list[float]:
 
 
 def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
-    """Return the quantiles of intensities (N,) at `PROBABILITIES`; None if there are none.
+    """Return the quantiles of intensities (N,) at `PROBABILITIES`, or None if there are none.
 
-    Intensities that are not finite are left out.
+    Intensities that are not finite do not count.
     """
     if intensity is None:
         return None
@@ -203,26 +224,33 @@ def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
 
 
 def is_constant(quantiles: np.ndarray | Sequence[float]) -> bool:
-    """Return whether nearly all intensities are the same, so that they say nothing."""
+    """Return whether nearly all intensities are equal, so that they say nothing."""
     low = quantiles[PROBABILITIES.index(0.01)]
     high = quantiles[PROBABILITIES.index(0.99)]
-    return bool(high - low <= CONSTANT * abs(quantiles[MEDIAN]))
+    return bool(high - low <= CONSTANT_SHARE * abs(quantiles[MEDIAN_INDEX]))
 
 
 def are_of_one_range(a: np.ndarray | None, b: np.ndarray | None) -> bool:
-    """Return whether the intensities of two scans have the same range, given their quantiles."""
+    """Return whether the intensities of two scans have one range.
+
+    Args:
+        a, b: the quantiles of each scan at `PROBABILITIES`, or None if it has no intensities.
+    """
     if a is None or b is None:
         return a is None and b is None
     if is_constant(a) or is_constant(b):
         return is_constant(a) and is_constant(b)
-    return _are_alike(a, b, factor=ONE_RANGE, least=DARKEST * max(a[-1], b[-1]))
+    return _are_alike(a, b, factor=ONE_RANGE_FACTOR, least=DARKEST_INTENSITY * max(a[-1], b[-1]))
 
 
 def _are_alike(
     a: np.ndarray | Sequence[float], b: np.ndarray | Sequence[float], factor: float, least: float
 ) -> bool:
-    """Return whether the medians and bright quantiles, at least `least`, differ by a factor."""
-    for index in (MEDIAN, BRIGHT):
+    """Return whether the medians, and the bright quantiles, differ by at most `factor`.
+
+    Smaller quantiles count as `least`.
+    """
+    for index in (MEDIAN_INDEX, BRIGHT_INDEX):
         low, high = sorted((max(a[index], least), max(b[index], least)))
         if high > factor * low:
             return False
@@ -235,9 +263,9 @@ class IntensityMap:
 
     Attributes:
         text: describes the map to the user.
-        scale: the divisor of the intensities; None if they are matched or filled in.
-        matched: what `matching` returns; None if the intensities are not matched.
-        trained: fills in missing intensities; if None, they become zeros.
+        scale: the divisor of the intensities, or None if they are matched or filled in.
+        matched: what `matching` returns, or None if the intensities are not matched.
+        trained: fills in missing intensities. If it is None, they become zeros.
     """
 
     text: str
@@ -246,7 +274,12 @@ class IntensityMap:
     trained: TrainedIntensity | None = None
 
     def __call__(self, intensity: np.ndarray | None, count: int) -> np.ndarray:
-        """Return a scan's intensities in [0, 1], (count,); NaN stays NaN."""
+        """Return the mapped intensities of a scan: (count,) in [0, 1]. NaN stays NaN.
+
+        Args:
+            intensity: (count,) intensities in the file, or None if it has none.
+            count: number of points.
+        """
         with np.errstate(over="ignore", invalid="ignore"):
             if intensity is not None and self.scale is not None:
                 return as_fractions(intensity, self.scale)
@@ -268,10 +301,10 @@ def intensity_map(
     training's, it is matched by its quantiles instead, unless the user gave the scale.
 
     Args:
-        quantiles: the quantiles of the raw intensities at `PROBABILITIES`; None if there are no
+        quantiles: the quantiles of the raw intensities at `PROBABILITIES`, or None if there are no
             intensities.
         scale: the largest possible intensity.
-        trained: the intensities of the training; None if unknown.
+        trained: the intensities of the training, or None if these are unknown.
         is_given: whether the user gave the scale.
     """
     if quantiles is None:
@@ -281,18 +314,19 @@ def intensity_map(
     if is_given:
         return linear
     if is_constant(quantiles):
-        text = f"intensity {quantiles[MEDIAN]:g} everywhere, so none ({describe_filler(trained)})"
+        median = f"{quantiles[MEDIAN_INDEX]:g}"
+        text = f"intensity {median} everywhere, so none ({describe_filler(trained)})"
         return IntensityMap(text, trained=trained)
     if trained is not None and trained.is_matched:  # the segmenter matches them, scan by scan
         return dataclasses.replace(linear, text=f"{linear.text}, spread as in the training")
     if trained is None or _are_alike(
-        quantiles / scale, trained.quantiles, factor=ALIKE, least=DARKEST
+        quantiles / scale, trained.quantiles, factor=ALIKE_FACTOR, least=DARKEST_INTENSITY
     ):
         return linear
 
     text = (
         f"intensity 0 to {scale:g}, spread as in the training: half of it was below "
-        f"{quantiles[MEDIAN] / scale:.2g}, now {trained.quantiles[MEDIAN]:.2g} "
+        f"{quantiles[MEDIAN_INDEX] / scale:.2g}, now {trained.quantiles[MEDIAN_INDEX]:.2g} "
         f"(--intensity-scale {scale:g} keeps it)"
     )
     return IntensityMap(text, matched=matching(quantiles, trained.quantiles))
@@ -314,7 +348,7 @@ def check_intensity(scan: Scan) -> Scan:
         InputError: if more than `WILD_SHARE` of the intensities are out of range.
     """
     intensity = scan.points[:, 3]
-    if intensity.min() >= 0 and intensity.max() <= 1:  # false if one is NaN
+    if intensity.min() >= 0 and intensity.max() <= 1:  # false if an intensity is NaN
         return scan
 
     valid = scan.valid

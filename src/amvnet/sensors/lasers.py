@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from amvnet.sensors.ground import MIN_DISTANCE, find_ground
 from amvnet.sensors.lidars import Sensor
 
-MIN_POINTS = 100  # fewer points say nothing about the sensor
+MIN_POINTS = 100  # smallest number of points from which a sensor is measured
 FOV_PERCENTILES = (0.5, 99.5)  # percentiles of the elevations at the ends of the field of view
 
-# Two sensors are alike if they differ by less than this.
-SAME_ANGLE = 6.0  # largest difference of each end of the field of view, degrees
-SAME_BEAMS = 1.4  # largest factor between the numbers of lasers
+SAME_ANGLE = 6.0  # largest difference of an end of the field of view of like sensors, degrees
+SAME_BEAMS = 1.4  # limit of the ratio between the numbers of lasers of like sensors
 
 MEASURES = ("beams", "fov_up", "fov_down", "height")  # the attributes of a SensorGeometry
 
@@ -40,7 +39,7 @@ class SensorGeometry:
 
     @property
     def field_of_view(self) -> tuple[float, float] | None:
-        """The upper and the lower end, degrees; None if one is unknown or they are swapped."""
+        """The upper and the lower end, degrees; None if an end is unknown or they are swapped."""
         if self.fov_up is None or self.fov_down is None or self.fov_up <= self.fov_down:
             return None
         return self.fov_up, self.fov_down
@@ -60,11 +59,11 @@ class SensorGeometry:
         return cls(**medians)
 
     def has_ends_of(self, other: SensorGeometry) -> bool:
-        """Return whether the fields of view are alike. Unknown ends are alike."""
+        """Return whether the fields of view are alike. An unknown end is like any other."""
         return _is_near(self.fov_up, other.fov_up) and _is_near(self.fov_down, other.fov_down)
 
     def is_like(self, other: SensorGeometry) -> bool:
-        """Return whether the lasers are alike. Unknown values are alike."""
+        """Return whether the lasers are alike. An unknown value is like any other."""
         if self.beams and other.beams:
             ratio = self.beams / other.beams
             if not 1 / SAME_BEAMS < ratio < SAME_BEAMS:
@@ -94,7 +93,10 @@ def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometr
 
     Args:
         points: (N, 3 or more) finite x, y, z in the sensor's frame, in the order of the file.
-        ring: (N,) index of each point's laser; None if the file has none.
+        ring: (N,) index of each point's laser, or None if the file has no rings.
+
+    Returns:
+        The geometry; values that the points do not show are None.
     """
     lasers = measure_lasers(points, ring)
     if lasers.fov_up is None:
@@ -104,7 +106,7 @@ def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometr
 
 
 def measure_lasers(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:
-    """Measure the lasers of a sensor as `measure` does, but not the sensor's height."""
+    """Measure the lasers of a sensor like `measure`, but not the height of the sensor."""
     xyz = points[:, :3].astype(np.float64)
     is_distant = np.hypot(xyz[:, 0], xyz[:, 1]) > MIN_DISTANCE
     if is_distant.sum() < MIN_POINTS:

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
 from amvnet.files import read_yaml
 
-# Heights over the ground on the cars that recorded KITTI and nuScenes, metres.
-HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
+# Heights of the sensors over the ground on the cars that recorded KITTI and nuScenes, metres.
+KNOWN_HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
 
-# Matrices that turn a file's x, y, z into forward, left, up.
+# Rotations that turn a file's x, y, z into forward, left, up, by the name of the file's axes.
 AXES = {
     "x-forward": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # x forward, y left, z up: ROS, KITTI
     "y-forward": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),  # x right, y forward, z up: nuScenes
@@ -28,21 +28,21 @@ AXES = {
     "z-down": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),  # x forward, y right, z down: aircraft
     "y-up": ((0, 0, -1), (-1, 0, 0), (0, 1, 0)),  # x right, y up, z backward: computer graphics
 }
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # each unit in metres
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # length of each unit, metres
 Triple = tuple[float, float, float]
-# How the names of a maker's LiDARs begin.
-MAKERS = {
+# Beginnings of the names of a maker's LiDARs.
+MAKER_PREFIXES = {
     "velodyne": ("hdl", "vlp", "vls"),
     "ouster": ("os",),
     "hesai": ("pandar", "xt"),
     "robosense": ("rs",),
 }
-LARGEST_NUMBER = 1e9  # largest number in the description of a sensor
+MAX_NUMBER = 1e9  # largest number in the description of a sensor
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What is known about a LiDAR and the frame of its scans. Values that are None are measured.
+    """What is known about a LiDAR and the frame of its scans. A value of None will be measured.
 
     Attributes:
         name: the name of the sensor; messages state it.
@@ -77,12 +77,12 @@ class Sensor:
         is_below = _is_within(self.fov_down, -90, top) and self.fov_down != top
 
         self._check("name", isinstance(self.name, str), "a text")
-        is_count = is_whole and _is_within(self.beams, 1, LARGEST_NUMBER)
+        is_count = is_whole and _is_within(self.beams, 1, MAX_NUMBER)
         self._check("beams", is_count, "a whole number")
         self._check("fov_up", _is_within(self.fov_up, -90, 90), "degrees from -90 to 90")
         self._check("fov_down", is_below, "degrees from -90 to 90, below fov_up")
         self._check("height", _is_within(self.height, 0, 100), "metres from 0 to 100")
-        is_scale = _is_within(self.intensity_scale, 0, LARGEST_NUMBER) and self.intensity_scale != 0
+        is_scale = _is_within(self.intensity_scale, 0, MAX_NUMBER) and self.intensity_scale != 0
         self._check("intensity_scale", is_scale, "a number above 0")
         self._check("unit", self.unit in (None, *UNITS), f"one of {', '.join(UNITS)}")
         self._check("axes", self.axes in (None, *AXES), f"one of {', '.join(AXES)}")
@@ -90,14 +90,18 @@ class Sensor:
         self._check("offset", _is_triple(self.offset), "x,y,z in metres, as 0,0,1.2")
 
     def _check(self, key: str, is_valid: bool, expected: str) -> None:
-        """Raise an InputError about an attribute unless its value is valid."""
+        """Check the value of an attribute.
+
+        Raises:
+            InputError: if the value is not valid.
+        """
         if not is_valid:
             found = shown(getattr(self, key))
             raise InputError(f"{key}: expected {expected}, found {found}; correct the value")
 
     @property
     def turn(self) -> NDArray[np.float64]:
-        """The (3, 3) rotation from the file's axes to the package's: x forward, y left, z up."""
+        """The (3, 3) rotation from the file's axes to the package's axes: forward, left, up."""
         axes = np.array(AXES[self.axes or "x-forward"], dtype=np.float64)
         return axes if self.rotate is None else rotation_from_degrees(*self.rotate) @ axes
 
@@ -105,7 +109,7 @@ class Sensor:
         """Return the points (N, 3) of a file in metres and in the package's axes.
 
         Unknown values change nothing. If the points are scaled, turned or moved, the result is
-        float64. Lost points, which are at the file's origin, then become NaN.
+        float64, and lost points, which lie at the file's origin, become NaN.
         """
         scale = UNITS[self.unit or "m"]
         turn = self.turn
@@ -113,7 +117,7 @@ class Sensor:
         if scale == 1 and not offset.any() and np.array_equal(turn, np.eye(3)):
             return xyz
 
-        # Numbers that become too large are infinite; then their points are invalid.
+        # Numbers that become too large turn infinite, which makes their points invalid.
         with np.errstate(over="ignore", invalid="ignore"):
             level: NDArray[np.floating] = xyz.astype(np.float64) * scale @ turn.T + offset
         level[(xyz == 0).all(axis=1)] = np.nan
@@ -206,8 +210,8 @@ def _read_sensor(text: str) -> Sensor:
 
 
 def _models_of(text: str) -> list[str]:
-    """Return the known LiDARs of a maker, or those whose names begin in the same way."""
-    beginnings = MAKERS.get(text.lower(), (text.lower(),))
+    """Return the known LiDARs of a maker, or the known LiDARs whose names begin with the text."""
+    beginnings = MAKER_PREFIXES.get(text.lower(), (text.lower(),))
     return [name for name in KNOWN_SENSORS if text and name.startswith(beginnings)]
 
 

@@ -17,9 +17,10 @@ from amvnet.sensors.intensity import are_of_one_range, quantiles_of
 from amvnet.sensors.lasers import SensorGeometry, measure_lasers
 from amvnet.sensors.lidars import Sensor
 
-MEASURED = 5  # number of scans that are measured in a recording; later scans get their median
-STEADY = 0.4  # metres; if heights in a recording differ by more, each scan gets its own height
-QUICK_STEP = 7  # every 7th point suffices for most sensors; 7 divides no usual number of lasers
+MEASURED_SCANS = 5  # number of measured scans in a recording; later scans get their median
+STEADY_HEIGHT = 0.4  # limit of the differences of height in a recording with one frame, metres
+# Step between the points that are measured first. 7 divides no usual number of lasers.
+QUICK_STEP = 7
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,8 @@ class Estimate:
     Attributes:
         frame: the frame of the coordinates in the files.
         lasers: the sensor's geometry, without its height.
-        quantiles: the quantiles of the intensities in the files; None if there are none.
+        quantiles: the quantiles of the intensities in the files at `PROBABILITIES`, or None if the
+            files have no intensities.
         is_steady: whether the scans were recorded in one frame, at one height.
     """
 
@@ -39,7 +41,7 @@ class Estimate:
     is_steady: bool = True
 
     def is_like(self, other: Estimate) -> bool:
-        """Return whether two estimates can be of one sensor.
+        """Return whether two estimates may belong to one sensor.
 
         The lasers and the ranges of the intensities must be alike.
         """
@@ -50,16 +52,17 @@ class Estimate:
 class Recording:
     """What is assumed about the scans of one recording.
 
-    The first `MEASURED` scans are measured, and each scan gets the median of their estimates. If
-    the first scans are of several sensors, each scan gets its own estimate. A later scan of another
-    sensor also gets its own.
+    The first `MEASURED_SCANS` scans are measured, and each scan gets the median of their estimates.
+    If the first scans are from several sensors, each scan gets its own estimate. So does a later
+    scan from another sensor.
 
     Args:
         sensor: what is known about the sensor; the rest is measured.
-        usual_height: the argument of `Frame.rises`.
+        usual_height: height of the weights' sensor, metres; see `Frame.rises`.
 
     Attributes:
-        usual: the median; None before anything is measured, or if there are several sensors.
+        usual: the median of the estimates. It is None before a scan is measured, and if there are
+            several sensors.
     """
 
     def __init__(self, sensor: Sensor, usual_height: float | None) -> None:
@@ -71,7 +74,7 @@ class Recording:
 
     @property
     def is_mixed(self) -> bool:
-        """Whether the first scans are of several sensors."""
+        """Whether the first scans are from several sensors."""
         return self._is_learnt and self.usual is None
 
     def recall(self, usual: Estimate | None) -> None:
@@ -80,7 +83,7 @@ class Recording:
         self._is_learnt = True
 
     def learn(self, first: Sequence[Callable[[], Cloud]]) -> None:
-        """Measure the first scans, which these functions read. Later scans are not measured."""
+        """Read and measure the first scans by these functions; later scans are not measured."""
         for read in first:
             if not self._is_learnt:
                 with suppress(InputError):
@@ -89,7 +92,11 @@ class Recording:
         self._is_learnt = bool(self._first)
 
     def estimate(self, cloud: Cloud) -> tuple[Estimate, bool]:
-        """Return what to assume about a scan, and whether its sensor is as expected."""
+        """Return what to assume about a scan, and whether its sensor is the usual sensor.
+
+        Raises:
+            InputError: if `find_frame` raises it.
+        """
         if self._is_learnt and self.usual is not None and self.usual.is_steady:
             if self._recognises(cloud, self.usual):
                 return self.usual, True
@@ -124,7 +131,7 @@ class Recording:
         return Estimate(frame, lasers, quantiles_of(cloud.measured_intensity()))
 
     def _recognises(self, cloud: Cloud, usual: Estimate) -> bool:
-        """Return whether a scan, assumed to be in the usual frame, is of the usual sensor.
+        """Return whether a scan in the usual frame is from the usual sensor.
 
         For most scans, every 7th point is enough to tell.
         """
@@ -145,11 +152,11 @@ class Recording:
         self._first.append(estimate)
         is_of_one_sensor = all(map(estimate.is_like, self._first))
         self.usual = median_of(self._first) if is_of_one_sensor else None
-        self._is_learnt = len(self._first) == MEASURED
+        self._is_learnt = len(self._first) == MEASURED_SCANS
 
 
 def median_of(estimates: Sequence[Estimate]) -> Estimate:
-    """Return the median of the known values of some estimates."""
+    """Return the estimate whose values are the medians of the known values of some estimates."""
     frames = [estimate.frame for estimate in estimates]
     quantiles = [each.quantiles for each in estimates if each.quantiles is not None]
 
@@ -166,14 +173,20 @@ def _are_steady(frames: Sequence[Frame]) -> bool:
     if len({(frame.unit, frame.axes) for frame in frames}) > 1:
         return False
     heights = [frame.height for frame in frames if frame.height is not None]
-    if heights and max(heights) - min(heights) >= STEADY:
+    if heights and max(heights) - min(heights) >= STEADY_HEIGHT:
         return False
     turns = np.array([(frame.pitch, frame.roll) for frame in frames])
     return bool((np.ptp(turns, axis=0) < STEADY_TILT).all())
 
 
 def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:
-    """Return a scan in the package's axes, with intensities (N,) in [0, 1]; by default zeros."""
+    """Return a scan in metres and in the package's axes: forward, left, up.
+
+    Args:
+        cloud: the points of a file.
+        sensor: the unit and the axes of the file.
+        intensity: (N,) intensities in [0, 1]; by default zeros.
+    """
     xyz = sensor.to_level(cloud.xyz)
     return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 

@@ -21,7 +21,7 @@ from amvnet.sensors.intensity import IntensityMap, TrainedIntensity, intensity_m
 from amvnet.sensors.lasers import SensorGeometry, elevations
 from amvnet.sensors.lidars import KNOWN_SENSORS, Sensor
 from amvnet.sensors.measure import (
-    MEASURED,
+    MEASURED_SCANS,
     Estimate,
     Recording,
     level_scan,
@@ -29,8 +29,9 @@ from amvnet.sensors.measure import (
     raise_points,
 )
 
-HIGHEST = 4.5  # metres; no vehicle carries its sensor higher, so the coordinates may be in feet
-OUTSIDE = 0.16  # largest share of the points outside a field of view that is wide enough
+# Largest height of a sensor on a vehicle, metres. A larger height may be in feet.
+MAX_SENSOR_HEIGHT = 4.5
+MAX_OUTSIDE_SHARE = 0.16  # limit of the share of the points outside a field of view that suffices
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ class Expectation:
         view: the range view of the weights.
         sensor: what is known about the sensor that the weights were trained for
             (`trained_sensor`).
-        intensity: the intensities that the weights were trained with; None if unknown.
+        intensity: the intensities that the weights were trained with, or None if these are unknown.
         as_is: whether the weights were trained on scans that were not normalised. Scans with the
-            same field of view then keep the training's rows, however many points are outside it.
+            same field of view then keep the training's rows, however many points lie outside it.
     """
 
     view: RangeViewConfig
@@ -53,19 +54,22 @@ class Expectation:
 
     @property
     def lasers(self) -> SensorGeometry:
-        """The geometry of the sensor."""
+        """The geometry of the sensor that the weights were trained for."""
         return SensorGeometry().override(self.sensor)
 
 
 def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> Scan:
     """Return a scan as some weights expect it; its points keep their order and number.
 
-    The scan is turned level and moved to the height of the training's sensor. If the weights' rows
-    are lasers and the scan's lasers are known, the lasers decide `Scan.row`. Otherwise the
-    elevations before the move, from which the sensor saw the points, decide it.
+    The scan is levelled and moved to the height of the training's sensor. If the weights' rows are
+    lasers and the scan's lasers are known, the lasers decide `Scan.row`. Otherwise the elevations
+    decide it, under which the sensor saw the points before the move.
 
     Args:
-        sensor: what is known about the sensor; takes precedence over the estimate.
+        cloud: the points of a file.
+        estimate: what was measured about the sensor.
+        sensor: what is known about the sensor; it takes precedence over the estimate.
+        expected: the scans that the weights expect.
 
     Raises:
         InputError: if no point is usable.
@@ -88,7 +92,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
 
 
 def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
-    """Return a line on what is assumed about a scan, and whether the weights know its sensor."""
+    """Return one line: what is assumed about a scan, and whether the weights know its sensor."""
     lasers = estimate.lasers.override(sensor)
     assumed = [
         cloud.note,
@@ -117,11 +121,11 @@ class Normaliser:
     """Normalise the scans of recordings, each recording by measuring its first scans.
 
     Args:
-        expected: what the weights expect. If it is None, scans are only turned as the sensor says,
-            for people to look at.
+        expected: the scans that the weights expect. If it is None, scans are only turned by the
+            description of the sensor, so that people can look at them.
         sensor: what is known about the scans' sensor; the rest is measured.
-        report: called with a line on what was assumed, once for each recording, and once for other
-            sensors in it.
+        report: called with one line on what was assumed, once for each recording, and once more if
+            the recording has scans from other sensors.
     """
 
     def __init__(
@@ -135,15 +139,16 @@ class Normaliser:
         self._report = report
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
-        self._said: set[str] = set()  # recordings whose line was already said
+        self._reported: set[str] = set()  # recordings whose line was already reported
 
     def expect(self, source: str, read: Callable[[], Cloud]) -> None:
         """Announce the next scan of a source, before any scan is normalised.
 
-        The first scans are then measured even if another process or run normalises them.
+        The first scans of the source are then measured even if another process or run normalises
+        them.
         """
         first = self._first.setdefault(source, [])
-        if len(first) < MEASURED:
+        if len(first) < MEASURED_SCANS:
             first.append(read)
 
     def __call__(self, cloud: Cloud, source: str) -> Scan:
@@ -161,8 +166,8 @@ class Normaliser:
         scan = normalise(cloud, estimate, self.sensor, self.expected)
 
         title = source if is_usual else f"{source}, other sensors"
-        if title not in self._said:
-            self._said.add(title)
+        if title not in self._reported:
+            self._reported.add(title)
             line = describe(cloud, estimate, self.sensor, self.expected)
             if recording.is_mixed:
                 line += f"; {source} has scans of other sensors, so that each is measured alone"
@@ -172,13 +177,13 @@ class Normaliser:
         return scan
 
     def measure(self, source: str) -> Recording:
-        """Return the recording of a source; measure its announced scans the first time."""
+        """Return the recording of a source. The first call measures its announced scans."""
         if source not in self._recordings:
             self._begin(source).learn(self._first.pop(source, []))
         return self._recordings[source]
 
     def recall(self, source: str, usual: Estimate | None) -> None:
-        """Normalise the scans of a source by what `measure` found in another process."""
+        """Normalise the scans of a source by the estimate that another process has measured."""
         self._begin(source).recall(usual)
 
     def _begin(self, source: str) -> Recording:
@@ -194,8 +199,8 @@ class Normaliser:
     def target(self) -> dict[str, float]:
         """Return the sensor's measures for weights that are trained on the normalised scans.
 
-        The height is the height to which the scans are moved. The lasers are the scans' lasers; but
-        if the rows of the range image are rings, they are the lasers that decide the rows.
+        The height is the height to which the scans are moved. The lasers are the scans' lasers. If
+        the rows of the range image are rings, they are the lasers that decide the rows instead.
         """
         assert self.expected is not None
         recordings = self._recordings.values()
@@ -211,22 +216,26 @@ class Normaliser:
         return dataclasses.replace(lasers, height=height).known()
 
     def _check_height(self, cloud: Cloud, frame: Frame) -> None:
-        """Raise InputError if the ground is too deep for coordinates in metres."""
+        """Check that the ground is not too deep for coordinates in metres.
+
+        Raises:
+            InputError: if the user gave neither height nor unit, and the ground is too deep.
+        """
         is_known = self.sensor.height is not None or self.sensor.unit is not None
-        if not is_known and frame.height is not None and frame.height > HIGHEST:
+        if not is_known and frame.height is not None and frame.height > MAX_SENSOR_HEIGHT:
             raise InputError(
-                f"{cloud.name}: expected a sensor at most {HIGHEST:g} m over the ground, found "
-                f"{frame.height:.1f}; give --unit ft if these are feet, else --height"
+                f"{cloud.name}: expected a sensor at most {MAX_SENSOR_HEIGHT:g} m over the ground, "
+                f"found {frame.height:.1f}; give --unit ft if these are feet, else --height"
             )
 
     def _turn(self, cloud: Cloud, source: str) -> Scan:
-        """Return a scan only turned as the sensor says."""
+        """Return a scan that is only turned, by the description of the sensor."""
         xyz = self.sensor.to_level(cloud.xyz)
         scale = self.sensor.intensity_scale or cloud.intensity_scale()
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
 
-        if source not in self._said:
-            self._said.add(source)
+        if source not in self._reported:
+            self._reported.add(source)
             has_intensity = cloud.intensity is not None and scale is not None
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
             negative = _describe_negative(cloud)
@@ -238,7 +247,7 @@ class Normaliser:
 def _intensity_map(
     cloud: Cloud, quantiles: np.ndarray | None, sensor: Sensor, expected: Expectation
 ) -> IntensityMap:
-    """Return how the intensities of a scan become like the training's."""
+    """Return the map from the intensities of a scan to intensities like the training's."""
     known_scale = sensor.intensity_scale
     scale = known_scale or 1.0
     if known_scale is None and quantiles is not None:
@@ -253,8 +262,8 @@ def _row_view(
 ) -> RangeViewConfig | None:
     """Return the range view that gives points (P, 4) their rows by elevation.
 
-    It is the weights' view. If too many points are outside its field of view, it gets the sensor's
-    field of view. Return None if the rows are rings whose elevations are unknown.
+    This is the weights' view, with the sensor's field of view if too many points are outside its
+    own. Return None if the rows are rings whose elevations are unknown.
     """
     view = _trained_view(lasers, expected)
     if view is None or (expected.as_is and lasers.has_ends_of(expected.lasers)):
@@ -263,7 +272,7 @@ def _row_view(
     elevation = elevations(points[:, :3].astype(np.float64))
     is_outside = (elevation > view.fov_up) | (elevation < view.fov_down)
     ends = lasers.field_of_view
-    if is_outside.mean() < OUTSIDE or ends is None:
+    if is_outside.mean() < MAX_OUTSIDE_SHARE or ends is None:
         return view
     return _by_elevation(view, ends, view.height)
 
@@ -271,8 +280,8 @@ def _row_view(
 def _trained_view(lasers: SensorGeometry, expected: Expectation) -> RangeViewConfig | None:
     """Return the range view of the weights with rows by elevation.
 
-    If the rows are rings, the highest laser gets the first row and the lowest laser the last.
-    Return None if their elevations are unknown.
+    If the rows are rings, the highest laser gets the first row, and the lowest laser gets the last
+    row. Return None if their elevations are unknown.
     """
     view = expected.view
     if view.rows != "ring":
@@ -285,9 +294,10 @@ def _trained_view(lasers: SensorGeometry, expected: Expectation) -> RangeViewCon
 
 
 def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) -> RangeViewConfig:
-    """Return the view with rows by elevation, for lasers from one elevation to another.
+    """Return the view with rows by elevation, for lasers between two elevations in degrees.
 
-    Its field of view is wider by half a step at each end, so that all lasers lie inside.
+    Its field of view is wider by half a step at each end, so that all lasers lie inside. There are
+    `steps` steps between the two elevations.
     """
     top, bottom = ends
     half = (top - bottom) / (2 * steps)
@@ -297,9 +307,9 @@ def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) 
 def _rows(
     scan: Scan, valid: np.ndarray, view: RangeViewConfig | None, expected: Expectation
 ) -> np.ndarray | None:
-    """Return the row of each point by elevation, (N,); 0 is the top, -1 a lost point.
+    """Return the row of each point by elevation: (N,), 0 is the top, -1 is a lost point.
 
-    Return None if the weights' rows are rings, and the scan's rings suit them, or nothing gives
+    Return None if the weights' rows are rings and the scan's rings suit them, or if no view gives
     rows.
     """
     ring = scan.ring if expected.view.rows == "ring" else None
@@ -312,7 +322,7 @@ def _rows(
     rows[valid] = RangeView(view).rows(PointBatch.of([scan])).numpy()
     if ring is not None:
         by_ring = view.height - 1 - ring
-        if np.median(np.abs(by_ring - rows)[valid]) < 1:  # most rings agree with the rows
+        if np.median(np.abs(by_ring - rows)[valid]) < 1:  # the rings agree with the elevations
             return None
     return rows
 
@@ -320,10 +330,10 @@ def _rows(
 def _rows_by_laser(
     cloud: Cloud, lasers: SensorGeometry, expected: Expectation
 ) -> np.ndarray | None:
-    """Return the row of each point by its laser, (N,); 0 is the top.
+    """Return the row of each point by its laser: (N,), 0 is the top.
 
-    Return None if the weights' rows are not lasers, the scan's lasers are unknown, or they are
-    unlike the training's lasers.
+    Return None if the weights' rows are not lasers, or if the scan's lasers are unknown or unlike
+    the training's lasers.
     """
     view = expected.view
     if not view.lasers or not lasers.has_ends_of(expected.lasers):
@@ -338,7 +348,7 @@ def _rows_by_laser(
 
 
 def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
-    """Return the guesses about the frame in words, each with the option that states it."""
+    """Return in words what was found about the frame, with the option that states each."""
     texts = []
     if sensor.unit is None and frame.unit != "m":
         texts.append(f"--unit {frame.unit}")
@@ -353,7 +363,10 @@ def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
 
 
 def _describe_negative(cloud: Cloud) -> str:
-    """Say how many points have an intensity below 0, which counts as 0; empty if none has."""
+    """Return in words how many points have an intensity below 0, which counts as 0.
+
+    Return an empty text if no point has.
+    """
     measured = cloud.measured_intensity()
     if measured is None or measured.min() >= 0 or measured.max() < 0:
         return ""
@@ -362,7 +375,7 @@ def _describe_negative(cloud: Cloud) -> str:
 
 
 def _describe_height(frame: Frame, sensor: Sensor, usual_height: float | None) -> str:
-    """Return in words how high the sensor is, and how far its scans are moved."""
+    """Return in words the height of the sensor, and how far its scans are moved up or down."""
     height = sensor.height if sensor.height is not None else frame.height
     if height is None:
         return "no ground to measure the height by (give --height; --axes if z is not up)"

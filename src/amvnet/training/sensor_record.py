@@ -13,16 +13,15 @@ from amvnet.data.datasets.joined import Joined
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
-from amvnet.sensors.intensity import KEY as INTENSITY
 from amvnet.sensors.intensity import (
-    MATCHED,
+    MATCHED_KEY,
     NO_INTENSITY,
+    QUANTILES_KEY,
     TrainedIntensity,
     are_quantiles,
     quantiles_of,
 )
-from amvnet.sensors.record import AS_IS, measure_sensor, normalised_record
-from amvnet.sensors.record import KEY as SENSOR
+from amvnet.sensors.record import AS_IS_KEY, SENSOR_KEY, measure_sensor, normalised_record
 
 SAMPLED_SCANS = 60  # most scans that are measured; enough for the mean height of simulated sensors
 
@@ -53,12 +52,12 @@ def sensor_record(
             quantiles_of_scans.append(quantiles)
     mean = np.mean(quantiles_of_scans, axis=0).round(4).tolist() if quantiles_of_scans else []
     is_known = mean == NO_INTENSITY or are_quantiles(mean)
-    record: dict[str, Any] = {INTENSITY: mean if is_known else []}
+    record: dict[str, Any] = {QUANTILES_KEY: mean if is_known else []}
 
     # The weights will get scans that are normalised in the same way, so record the normalisation.
     first = dataset.dataset if isinstance(dataset, Joined) else dataset
     normalised = normalised_record(first) if isinstance(first, OwnScans) else {}
-    record |= normalised or {SENSOR: {**measure_sensor(scans), AS_IS: True}}
+    record |= normalised or {SENSOR_KEY: {**measure_sensor(scans), AS_IS_KEY: True}}
     if intensity is not None and intensity.is_matched:
-        record |= {INTENSITY: list(intensity.quantiles), MATCHED: True}
+        record |= {QUANTILES_KEY: list(intensity.quantiles), MATCHED_KEY: True}
     return record

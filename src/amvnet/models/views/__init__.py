@@ -1,1 +1,1 @@
-"""Projections of scans, and the mapping of scores back to the points."""
+"""Project scans, and map scores back to the points."""

@@ -1,4 +1,4 @@
-"""The points of one or more scans as one batch, which the views and networks take."""
+"""Put the points of one or more scans into one batch, which the views and networks take."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from amvnet.scan import Scan
 def occurring(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     """Find which of the indices 0..count - 1 occur in any of the tensors `indices`.
 
-    This does what `torch.unique` does, without a sort.
+    This is what `torch.unique` does, but without a sort.
 
     Returns:
-        The M indices that occur, ascending; and for each tensor in `indices`, the places of its
-        values among these M.
+        The M indices that occur, ascending, (M,); and for each tensor in `indices`, the places of
+        its values among these M indices.
     """
-    # With one place before the first, the cumulative sum counts the smaller indices.
+    # There is one place before the first index, so that the cumulative sum counts smaller indices.
     padded = torch.zeros(count + 1, dtype=torch.bool, device=indices[0].device)
     occurs = padded[1:]
     for index in indices:
@@ -35,7 +35,7 @@ def occurring(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
 
 
 def concatenate(parts: Sequence[Tensor]) -> Tensor:
-    """Concatenate tensors along their first axis; a single one is not copied."""
+    """Concatenate tensors along their first axis; a single tensor is not copied."""
     return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
@@ -45,15 +45,15 @@ class PointBatch:
 
     Attributes:
         points: (P, 4) float32: x, y, z in metres, intensity in [0, 1]; all finite.
-        scan: (P,) int64: the scan that each point belongs to, 0..B - 1; ascending.
+        scan: (P,) int64: the scan that each point belongs to, 0..B - 1, ascending.
         count: B, the number of scans.
-        ring: (P,) int64: index of the laser, 0 the lowest; -1 if it is unknown; None if no scan
-            has rings.
-        row: (P,) int64: row of the range image, 0 the top; -1 if it is unknown; None if no scan
-            has rows.
+        ring: (P,) int64 indices of the lasers: 0 is the lowest laser, -1 is unknown. None if no
+            scan has rings.
+        row: (P,) int64 rows of the range image: 0 is the top, -1 is unknown. None if no scan has
+            rows.
         names: the names of the scans.
-        sizes: the number of points of each scan. If it is empty, the points have to be counted, for
-            which the CPU waits for a GPU.
+        sizes: the number of points of each scan. If it is empty, the points have to be counted, and
+            for this the CPU waits for a GPU.
     """
 
     points: Tensor
@@ -72,7 +72,7 @@ class PointBatch:
         if isinstance(where, torch.dtype):
             return replace(self, points=self.points.to(where))
 
-        # A copy from a GPU has to block. Otherwise it could be read before it is complete.
+        # A copy from a GPU has to block: otherwise it could be read before it is complete.
         to_gpu = torch.device(where).type == "cuda"
         return self._map(lambda values: values.to(where, non_blocking=to_gpu))
 
@@ -109,8 +109,8 @@ class PointBatch:
     def of(cls, scans: Sequence[Scan], device: torch.device | str = "cpu") -> PointBatch:
         """Return a batch of the valid points (`Scan.valid`) of one or more scans, in order.
 
-        If the device is a GPU, points are first copied into pinned memory. torch reuses that memory
-        for the next batch.
+        For a GPU, points are first copied into pinned memory, which torch uses again for the next
+        batch.
         """
         valid = [scan.valid for scan in scans]
         sizes = tuple(int(np.count_nonzero(mask)) for mask in valid)

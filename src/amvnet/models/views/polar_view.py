@@ -1,4 +1,4 @@
-"""The bird's-eye view: a scan in a polar grid of pillars. A pillar is a column of voxels."""
+"""Project scans to the bird's-eye view: a polar grid of pillars, which are columns of voxels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from amvnet.config.schema import PolarViewConfig
 from amvnet.models.views.points import PointBatch, occurring
 from amvnet.runtime.threads import run_parts
 
-FEATURES = 9  # offset from the voxel's centre (3), polar coordinates (3), x, y, intensity
+# Number of features of a point: offset from the voxel's centre (3), polar coordinates (3), x, y,
+# intensity.
+FEATURES = 9
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class PolarGrid:
         voxel: (P,) int64: each point's voxel within its pillar; 0 is the lowest.
         occupied: (M,) int64: the pillars that hold points, ascending.
         slot: (P,) int64: each point's pillar as an index into `occupied`.
-        seen: (F,) int64: the pillars that hold points which the networks see, ascending.
+        seen: (F,) int64: the pillars with points that the networks see, ascending.
         seen_slot: (S,) int64: the pillar of each point that the networks see, as an index into
             `seen`.
         shape: (B, R, A, Z): scans, and cells along radius, angle and height.
@@ -102,7 +104,10 @@ class PolarGrid:
 
 
 def _pillar_maximum(features: Tensor, slot: Tensor, pillars: int) -> Tensor:
-    """Return the maximum (F, C) in each pillar of the features (S, C) with pillars `slot` (S,)."""
+    """Return the maximum (F, C) of the points' features (S, C) in each of F pillars.
+
+    `slot` (S,) is the pillar of each point.
+    """
     zeros = features.new_zeros(pillars, features.shape[1])
     index = slot[:, None].expand_as(features)
     return zeros.scatter_reduce(0, index, features, "amax", include_self=False)
@@ -111,7 +116,7 @@ def _pillar_maximum(features: Tensor, slot: Tensor, pillars: int) -> Tensor:
 class _PillarMaximum(torch.autograd.Function):
     """`_pillar_maximum` whose gradient is computed faster on a CPU.
 
-    In each channel, only the points that have the maximum have a gradient. The backward pass that
+    In each channel, only the points with the maximum have a gradient. The backward pass that
     autograd derives reads all points several times, which took a third of a training step.
     """
 
@@ -126,7 +131,7 @@ class _PillarMaximum(torch.autograd.Function):
         features, slot, pooled = ctx.saved_tensors
         channels = features.shape[1]
 
-        # Find the largest values: their places in the flattened features and in the flattened
+        # Find the places of the largest values in the flattened features and in the flattened
         # maxima.
         place = (features == pooled.index_select(0, slot)).flatten().nonzero()[:, 0]
         maximum = slot[place // channels] * channels + place % channels
@@ -147,9 +152,9 @@ class PolarView:
         self._axes_on: dict[torch.device, tuple[Tensor, ...]] = {}
 
     def _axes(self, device: torch.device) -> tuple[Tensor, ...]:
-        """Return the start and length of the axes, their numbers of cells, and their last cells.
+        """Return the start, the length, the number of cells and the last cell of the axes.
 
-        Each is (3, 1) float64, for radius, angle and height.
+        Each is (3, 1) float64, for the axes radius, angle and height.
         """
         if device not in self._axes_on:
             c = self.config
@@ -168,7 +173,7 @@ class PolarView:
         """
         c = self.config
 
-        # Python's numbers would be copied to a GPU each time.
+        # The axes are tensors because Python's numbers would be copied to a GPU each time.
         low, length, cells, last = self._axes(batch.points.device)
         polar = batch.cylindrical
         cell = (polar - low).div_(length).mul_(cells).floor_().clamp_min_(0).minimum(last)

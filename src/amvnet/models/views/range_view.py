@@ -1,4 +1,4 @@
-"""The range view: a scan as an image, with lasers as rows and the azimuth as columns."""
+"""Project scans to the range view: images with lasers as rows and azimuths as columns."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from amvnet.config.schema import RangeViewConfig
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 
-CHANNELS = 6  # x, y, z, intensity, range, mask
-_INDEX_BITS = 32  # lower bits of a key in `_nearest`: a point's index; the upper bits: its range
+CHANNELS = 6  # number of channels of a range image: x, y, z, intensity, range, mask
+# Number of lower bits in a key of `_nearest` that hold a point's index; the upper bits hold the
+# range of the point.
+_INDEX_BITS = 32
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class RangeImage:
         image: (B, 6, H, W) float32: x, y, z, intensity, range, and a mask that is 1 if the pixel
             has a point. All values of a pixel without a point are 0.
         pixel: (P,) int64: each point's pixel, an index into the B * H * W pixels of the batch.
-        nearest: (B * H * W,) int32: the point that represents each pixel, -1 if it has none.
+        nearest: (B * H * W,) int32: the index of the point that each pixel shows; -1 for no point.
     """
 
     image: Tensor
@@ -50,10 +52,10 @@ class RangeView:
     def project(self, batch: PointBatch) -> RangeImage:
         """Return the range images of a batch of scans.
 
-        Every point has a pixel. Points above the field of view are in the first row, points below
-        it in the last. A pixel with several points shows the point nearest to the sensor; if
-        several are equally near, it shows the first. No pixel shows points of the car's own body
-        (`RangeViewConfig.nearest`).
+        Every point has a pixel. Points above the field of view are in the first row, and points
+        below it are in the last row. A pixel with several points shows the point that is nearest to
+        the sensor; if several points are equally near, it shows the first of them. No pixel shows
+        points of the car's own body (`RangeViewConfig.nearest`).
 
         Raises:
             InputError: if `rows` raises it.
@@ -76,7 +78,7 @@ class RangeView:
     def columns(self, batch: PointBatch) -> Tensor:
         """Return the columns (P,) of the points by their azimuth.
 
-        The front (+x) is in the middle of the image, the left (+y) in its left half.
+        The front (+x) is in the middle of the image, and the left (+y) is in its left half.
         """
         azimuth = batch.cylindrical[1]
         return _cells(0.5 - azimuth / (2 * math.pi), self.config.width)
@@ -84,11 +86,11 @@ class RangeView:
     def rows(self, batch: PointBatch) -> Tensor:
         """Return the rows (P,) of the points; 0 is the top.
 
-        A scan's own rows (`Scan.row`) take precedence over the configured ones.
+        A scan's own rows (`Scan.row`) take precedence over the configured rows.
 
         Raises:
-            InputError: if a row is out of range. If rows are configured to be rings: if a scan
-                without rows has no ring indices, or one of them is out of range.
+            InputError: if a row is out of range. If rows are configured to be rings, also if a scan
+                without rows has no ring indices, or a ring index is out of range.
         """
         if batch.row is None:
             return self._configured_rows(batch)
@@ -109,7 +111,8 @@ class RangeView:
         """Return the rows (P,) that `RangeViewConfig.rows` asks for.
 
         Args:
-            which: (P,) bool: the points whose rows are needed; by default all.
+            batch: the batch of scans.
+            which: (P,) bool: the points whose rows are needed; by default all points.
         """
         if self.config.rows == "ring":
             return self._rows_by_ring(batch.ring, which)
@@ -149,34 +152,34 @@ class RangeView:
 
 
 def _range_of(values: Tensor, which: Tensor | None = None) -> tuple[int, int]:
-    """Return the least and the greatest of some integers; 0 and 0 if there are none."""
+    """Return the smallest and the largest of some integers; 0 and 0 if there are none."""
     chosen = values if which is None else values[which]
     if not len(chosen):
         return 0, 0
-    # Copied together, so that the CPU waits for a GPU only once.
+    # One copy of both numbers makes the CPU wait for a GPU only once.
     lowest, highest = torch.stack(chosen.aminmax()).tolist()
     return lowest, highest
 
 
 def _cells(fractions: Tensor, cells: int) -> Tensor:
-    """Divide [0, 1] into equal cells, and return each number's cell, (P,) int64.
+    """Divide [0, 1] into equal cells, and return the cell of each of P numbers: (P,) int64.
 
-    Numbers outside [0, 1] go to the nearest cell.
+    A number outside [0, 1] goes to the nearest cell.
     """
     return (fractions * cells).long().clamp_(0, cells - 1)
 
 
 def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tensor:
-    """Return the (pixels,) int32 index of the nearest point in each pixel, -1 if it has none.
+    """Return the index of the nearest point in each pixel: (pixels,) int32, -1 for no point.
 
     Args:
-        distance: (P,) metres.
-        pixel: (P,) the pixel of each point.
-        pixels: the number of pixels.
-        least: metres; nearer points do not count.
+        distance: (P,) distance of each point, metres.
+        pixel: (P,) pixel of each point.
+        pixels: number of pixels.
+        least: smallest distance of a point that counts, metres.
     """
-    # The bits of floats >= 0 sort as the floats do. So the minimum of integers that hold a distance
-    # above an index gives both the least distance and its point.
+    # The bits of floats >= 0 have the order of the floats. So if integers hold a distance in their
+    # upper half and an index in their lower half, their minimum gives the nearest point.
     index = torch.arange(len(distance), device=distance.device)
     key = index.add(distance.float().view(torch.int32), alpha=1 << _INDEX_BITS)
 
