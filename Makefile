@@ -1,7 +1,7 @@
-# Everything runs in a virtual environment of its own, .venv.
+# Everything runs in the virtual environment .venv.
 PYTHON ?= python3
 BIN := .venv/bin
-# A process for each processor, and one thread in each. The tests of a file share what they make, so one process runs them.
+# Each processor runs one process with one thread. One process runs all tests of a file, because they share what they make.
 SPREAD := OMP_NUM_THREADS=1
 
 .PHONY: install demo test test-slow bench gpu docs lint format release clean
@@ -14,10 +14,10 @@ demo: .venv/installed  ## simulate streets, segment and score them, and show all
 test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 measures which lines they run
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile $(if $(COVERAGE),--cov=amvnet --cov=lidarstreets --cov-report=term:skip-covered)
 
-test-slow: .venv/installed .venv/fleet  ## the tests that take minutes, and those of fleets, too
+test-slow: .venv/installed .venv/fleet  ## all tests, also the tests that take minutes and the tests of fleets
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"
 
-bench: .venv/installed  ## the time of a scan, and what each optimisation gives: half an hour; SCAN="--scan FILE" for a scan of yours
+bench: .venv/installed  ## the time of a scan, and the gain by each optimisation, in half an hour; SCAN="--scan FILE" for a scan of yours
 	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8
 
 gpu: .venv/installed  ## on a machine with a GPU: its tests and its tables, to paste into an issue; SCAN="--scan FILE" for a scan of yours
@@ -39,14 +39,14 @@ format: .venv/installed
 release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushing the tag publishes it
 	$(PYTHON) .ci/release.py $(VERSION)
 
-# torch first and by itself: pinned, so that no other build is drawn in.
+# torch is installed first and alone, with a pinned version, so that no other build of it is installed.
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[simulate,formats,export,test]"
 	touch $@
 
-# 600 MB, so that `make test` does without.
+# These packages take 600 MB, so `make test` does not need them.
 .venv/fleet: .venv/installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fleet]" "moto[server]>=5" duckdb "dask[dataframe]"
 	touch $@
@@ -55,7 +55,7 @@ release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushin
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
 	touch $@
 
-# What the page docs/try runs and is tested with. Without npm, the build says that it leaves the page out.
+# The packages that the page docs/try and its tests need. Without npm, the build reports that it leaves the page out.
 docs/try/node_modules: docs/try/package-lock.json
 	if command -v npm > /dev/null; then npm ci --prefix docs/try --ignore-scripts --no-audit --no-fund --silent; fi
 

@@ -1,12 +1,13 @@
-"""Score weights on nuScenes scans that have boxes and no labels of the points.
+"""Score weights on nuScenes scans that have boxes, but no labels of the points.
 
     python benchmarks/boxes.py DATA BOXES WEIGHTS
 
 DATA is a nuScenes dataset. BOXES is a folder with a file NAME_boxseg.bin for each NAME.pcd.bin: one
-uint8 per point, the train id of the box that the point is in, 0 in a box of another class and 255
-in no box. For each class, and for cars, trucks and buses together, print the share of the points in
-its boxes that each method gives this class. These shares tell less than an IoU: a box also holds
-some points of the ground, and the classes outside of the boxes are unknown.
+uint8 per point, which is the train id of the box around the point, 0 in a box of another class, and
+255 outside of all boxes. For each class, and for cars, trucks and buses together, the table shows
+the share of the points in its boxes to which each method gives this class. These shares tell less
+than an IoU, because a box also contains some points of the ground, and the classes outside of the
+boxes are unknown.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.scoring import labels_by_method
 from amvnet.models.methods import PAPER_METHODS
 
-BOXED = 10  # classes that have boxes are the first ones
+BOXED = 10  # number of classes that have boxes; they are the first classes
 LARGE_VEHICLES = ("car", "truck", "bus")
 
 

@@ -3,10 +3,11 @@
     python benchmarks/busy.py [--scan FILE] [--calls N] [--scans N] [--busy 0,1,2]
         [--settings "passive,one thread"] [--commands predict,evaluate]
 
-The last table has the time of each command as it is, next to its time with passive waiting.
+The last table has the time of each command in the default setting, next to its time with passive
+waiting.
 
-Each setting runs in a process of its own. The busy processes run empty loops, to keep a processor
-busy each. Run this on a machine that has nothing else to do.
+Each setting runs in its own process. Each busy process keeps one processor busy with an empty loop.
+Run this on a machine that has nothing else to do.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from rich.table import Table
 from amvnet.runtime.threads import WAITING
 from lidarstreets import simulate
 
-WARM_UP = 2  # calls that are not counted
+WARM_UP = 2  # number of calls that do not count
 WEIGHTS = "sim-hdl64e"
 
 # The environment of each setting. The command line makes its default passive.
@@ -41,7 +42,7 @@ SETTINGS: dict[str, dict[str, str]] = {
     "one thread": {"OMP_NUM_THREADS": "1"},
 }
 
-# The commands that compute: with labelled scans, their files, and a folder to write to.
+# The commands that compute, with places for labelled scans, their files, and an output folder.
 COMMANDS = {
     "predict": "predict {files} --weights {weights} --out {out} --scores",
     "evaluate": "evaluate semantickitti:{data} --split all --weights {weights}",
@@ -132,7 +133,7 @@ def time_command(command: str, data: Path, setting: str) -> float:
 
 def compare_commands(commands: list[str], scans: int, busy: list[int]) -> Table:
     """Return a table of the commands' seconds as they are, and with passive waiting."""
-    title = "seconds as it is / with OMP_WAIT_POLICY=passive, and their ratio"
+    title = "seconds by default / with OMP_WAIT_POLICY=passive, and their ratio"
     table = Table("command", *[f"{count} busy" for count in busy], title=title)
     with TemporaryDirectory() as temporary:
         data = simulate(Path(temporary), sequences=2, scans=scans)

@@ -1,12 +1,13 @@
-"""Measure what units, frames and intensities of other tools cost.
+"""Measure the loss of accuracy by units, frames and intensities of other tools.
 
     python benchmarks/changed_scans.py DATA [WEIGHTS] [--scans 10]
 
-DATA is a dataset in the layout of SemanticKITTI, such as semantickitti:PATH; the scans are spread
-evenly over its sequences. Each is changed and then labelled as `amvnet predict` labels a file of
-it: without options, and, if scans are then refused or more than a tenth of the accuracy is lost,
-with the option that undoes the change. Offsets are always tried, as they must not hurt. Print the
-accuracy, and its share of the accuracy on the unchanged scans.
+DATA is a dataset in the layout of SemanticKITTI, such as semantickitti:PATH. The scans are spread
+evenly over its sequences. Each scan is changed, and then labelled as `amvnet predict` labels a file
+of it. This is done without options at first. If scans are refused, or more than a tenth of the
+accuracy is lost, it is repeated with the option that undoes the change. Offsets are always tried,
+because they must not harm. The table shows the accuracy, and its share of the accuracy on unchanged
+scans.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import AXES, KNOWN_HEIGHTS, make_sensor, rotation_from_degrees
 
-GOAL = 0.9  # share of the accuracy on unchanged scans
-HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # metres of the sensor over the ground
+GOAL = 0.9  # least share of the accuracy on unchanged scans
+HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # height of the sensor above the ground, metres
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,9 @@ class Change:
     """A way in which tools change a scan.
 
     Attributes:
-        title: for the table.
-        apply: returns the changed cloud, given (N, 3) coordinates and (N,) intensities.
-        options: the options of `amvnet predict` that undo it, as attributes of a `Sensor`.
+        title: the title of the row in the table.
+        apply: a function that returns the changed cloud of (N, 3) coordinates and (N,) intensities.
+        options: the options of `amvnet predict` that undo the change, as attributes of a `Sensor`.
     """
 
     title: str

@@ -3,10 +3,11 @@
     python benchmarks/fleet.py [--scans 400] [--workers 2]
     python benchmarks/fleet.py --names 10000000
 
-The first prints what `predict` and `fleet` take to start and for each scan, from files; then it
-compares the labels in a bucket with those of `predict`, also after a worker and the driver are
-killed. The second plans a manifest of made-up names, twice, and prints the memory that it takes.
-Needs the packages of `make test-slow`.
+The first command prints the time that `predict` and `fleet` take to start, and for each scan in a
+file. Then it compares the labels that `fleet` writes to a bucket with the labels that `predict`
+writes, also after a worker and the driver are killed. The second command plans a manifest of
+made-up names twice, and prints the memory that it takes. Both need the packages of
+`make test-slow`.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ from fixtures.s3_server import Bucket, s3_server
 WEIGHTS = "sim-hdl64e"
 TO = ("--weights", WEIGHTS, "--out")
 DRIVES = 4
-FEW = 5  # scans of each drive, to tell the time of the start
-DRIVE = 1000  # names of each made-up drive
+FEW = 5  # number of scans of each drive from which the time of the start is told
+DRIVE = 1000  # number of names in each made-up drive
 
 
 def main() -> None:
@@ -52,7 +53,7 @@ def main() -> None:
 
 
 def compare(root: Path, bucket: Bucket, scans: int, workers: int) -> None:
-    """Label the same scans by `predict`, and on Ray undisturbed and with kills; print both."""
+    """Label the same scans by `predict` and on Ray, undisturbed and with kills; compare them."""
     simulated = root / "streets"
     amvnet("simulate", simulated, "--sequences", DRIVES, "--scans", scans // DRIVES)
     for folder in sorted(simulated.glob("sequences/*/velodyne")):

@@ -2,10 +2,11 @@
 
     python benchmarks/gpu.py [--scan FILE]
 
-It takes about five minutes. The tables say, at the paper's and at the compact size: scans per
-second from points to labels, one by one and in batches, with networks whose kernels are launched
-one by one and with CUDA graphs; kernels launched, the time that the GPU is busy, and memory; each
-stage; where the processor waits; `predict` from disk; and training with its loaders.
+It takes about five minutes. For networks of the paper's size and of the compact size, the tables
+show the scans per second from points to labels, one by one and in batches, with kernels that are
+launched one by one and with CUDA graphs. They also show the number of launched kernels, the time
+that the GPU is busy, the memory, the time of each stage, the places where the processor waits, and
+the rates of `predict` from disk and of training with its loaders.
 
 Without a GPU, check that the benchmark itself works:
 

@@ -1,6 +1,6 @@
-"""Compare graphs in int8 with those in float32, both in ONNX Runtime.
+"""Compare graphs in int8 with graphs in float32, both in ONNX Runtime.
 
-Prints the mIoU of each method, and the time of each graph and of a whole scan.
+The tables show the mIoU of each method, and the time of each graph and of a whole scan.
 
     amvnet export --weights W --out FLOAT && amvnet export --weights W --out INT8 --int8 simulated
     python benchmarks/int8.py FLOAT INT8 DATA [THREADS]
@@ -48,7 +48,7 @@ class Runner(OnnxSegmenter):
         return super()._run(name, *inputs)
 
     def label(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Return the finite points' labels by method, and which of them are uncertain."""
+        """Return the labels of finite points by method, and (P,) bool: the uncertain points."""
         scan = match_scan(scan, self.intensity)
         valid = scan.select(scan.valid)
         points = valid.points

@@ -1,4 +1,4 @@
-"""Run predict on a drive of 1,000 scans: measure its memory, and compare with a run that is killed.
+"""Run predict on a drive of 1,000 scans, measure its memory, and compare it with a killed run.
 
     python benchmarks/long_drive.py FOLDER [SCANS] [METHOD]
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from lidarstreets import simulate
 
-KILLED_AT = (0.3, 0.6)  # shares of the scans
+KILLED_AT = (0.3, 0.6)  # shares of the scans that are done when a run is killed
 
 
 def predict(folder: Path, out: Path, method: str, until: int) -> list[int]:

@@ -2,8 +2,8 @@
 
     python benchmarks/many_scans.py FOLDER [--engines torch,int8] [--at-once 1,2] [--rounds N]
 
-FOLDER holds ten scan files or more, such as *.bin. The rate of `predict` is that of the label files
-after the first few, without the start of the program.
+FOLDER holds ten scan files or more, such as *.bin. The rate of `predict` is the rate at which label
+files appear, without the first few, so that the start of the program does not count.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from amvnet import load
 from amvnet import read as read_scan
 from amvnet.inference.scan_stream import stream_scans
 
-WARM_UP = 4  # scans that do not count
+WARM_UP = 4  # number of scans that do not count
 WEIGHTS = "sim-hdl64e"
-SLEEPING = {**os.environ, "OMP_WAIT_POLICY": "passive"}  # as the commands
+SLEEPING = {**os.environ, "OMP_WAIT_POLICY": "passive"}  # the environment of commands
 
 
 def main() -> None:

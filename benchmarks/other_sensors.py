@@ -1,10 +1,10 @@
-"""Measure what normalising is worth on simulated scans of sensors that the weights do not know.
+"""Measure the gain by normalisation on simulated scans of sensors that the weights do not know.
 
     python benchmarks/other_sensors.py [FOLDER] [WEIGHTS]
 
-Each scan is segmented as it is, and normalised as by `amvnet predict`. FOLDER (other_sensors) keeps
-the scans: six for each sensor, of three streets that no training has seen. WEIGHTS is a name or a
-file (sim-hdl64e).
+Each scan is segmented unchanged, and then normalised as `amvnet predict` normalises it. FOLDER
+(other_sensors) keeps the scans, which are six for each sensor, of three streets that no training
+has seen. WEIGHTS is a name or a file (sim-hdl64e).
 """
 
 from __future__ import annotations
@@ -58,23 +58,23 @@ OTHERS = {
 
 
 def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
-    """Print mIoU over the classes present and accuracy of AMVNet, as it is and normalised."""
+    """Print mIoU over the classes present and accuracy of AMVNet, unchanged and normalised."""
     dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
     normalise = normaliser_for(segmenter.weights)
-    as_it_is = Evaluation(dataset.taxonomy)
+    unchanged = Evaluation(dataset.taxonomy)
     normalised = Evaluation(dataset.taxonomy)
 
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record)
         assert scan.labels is not None
         labels = segmenter(scan).labels
-        as_it_is.add(scan.points, scan.labels, {"amvnet": labels})
+        unchanged.add(scan.points, scan.labels, {"amvnet": labels})
 
         cloud = Cloud(scan.points[:, :3], scan.points[:, 3], name=name)
         labels = segmenter(normalise(cloud, name)).labels
         normalised.add(scan.points, scan.labels, {"amvnet": labels})
 
-    for title, evaluation in (("as it is", as_it_is), ("measured", normalised)):
+    for title, evaluation in (("unchanged", unchanged), ("measured", normalised)):
         report = evaluation.report(name)["methods"]["amvnet"]
         miou = 100 * report["miou_present"]
         accuracy = 100 * report["accuracy"]

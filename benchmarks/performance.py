@@ -1,6 +1,6 @@
-"""Measure what a scan costs on this machine's CPU, next to SalsaNext.
+"""Measure the time of a scan on this machine's CPU, next to the time of SalsaNext.
 
-Also measure what each optimisation gives, by taking it away.
+Also measure the gain by each optimisation, which is taken away for that.
 
     python benchmarks/performance.py [--scan FILE] [--rounds N] [--runs N] [--engines torch,onnx]
 """
@@ -40,9 +40,9 @@ from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.polar_view import PolarGrid
 from lidarstreets import simulate
 
-HEIGHT = 64  # of the range image that SalsaNext is timed on
-WIDTH = 2048
-WARM_UP = 2
+HEIGHT = 64  # height of the range image for SalsaNext
+WIDTH = 2048  # width of this image
+WARM_UP = 2  # number of runs that do not count
 
 
 def without_folding() -> None:
@@ -60,7 +60,7 @@ def without_pykdtree() -> None:
 
 
 def without_occupied_pillars() -> None:
-    """Score every voxel of every pillar, and select those of the occupied pillars."""
+    """Score every voxel of every pillar, and select the scores of occupied pillars."""
 
     def forward(self: PolarNet, grid: PolarGrid) -> Tensor:
         pillars = self.compress(self.pool(grid))
@@ -99,7 +99,7 @@ def without_sharing() -> None:
     PointHead.classify = classify  # type: ignore[method-assign]
 
 
-UNCHANGED = "as it is"
+UNCHANGED = "unchanged"
 ALL = "all of these"
 REMOVALS: dict[str, Callable[[], None]] = {
     "batch norms not folded": without_folding,

@@ -1,9 +1,10 @@
-"""Score weights place by place, as an easy place may hide what the others lack.
+"""Score weights place by place, because a good score of one place may hide others.
 
     python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--every N] [--calibrated B]
 
-DATA is a dataset such as semantickitti:PATH; each of its sequences is a place. Print mIoU over all
-classes and accuracy of each method, and the share of uncertain points, for each place and for all.
+DATA is a dataset such as semantickitti:PATH. Each of its sequences is a place. The table shows the
+mIoU over all classes and the accuracy of each method, and the share of uncertain points, for each
+place and for all places together.
 With --no-intensity, the intensities of all scans are set to 0. With --every N, only every Nth scan
 is scored. For weights of `amvnet.weights.calibrate --bev B`, --calibrated B also scores the plain
 ensemble, in which both networks have the same weight as in the paper.

@@ -1,4 +1,4 @@
-"""SalsaNext's network as its paper describes it, with random weights, to compare times with.
+"""Build the network of SalsaNext as its paper describes it, with random weights, to compare times.
 
 Cortinhas, Tzelepis, Aksoy: SalsaNext: Fast, Uncertainty-aware Semantic Segmentation of LiDAR Point
 Clouds (2020).

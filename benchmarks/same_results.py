@@ -3,16 +3,16 @@
     python benchmarks/same_results.py make OUT [--real FOLDER]
     python benchmarks/same_results.py compare BEFORE AFTER
 
-`make` runs the installed amvnet (or that of PYTHONPATH) through its command line and its public
-functions, keeps what they write in OUT, and writes OUT/digests.json: a digest of each array,
-tensor, figure and graph. Dates, durations, versions and progress text are left out. `--real` adds
-real scans; FOLDER has semantickitti/ and nuscenes/ in the layout of their benchmarks, and formats/
-with scan files of other formats.
+`make` runs amvnet, the installed one or the one in PYTHONPATH, through its command line and its
+public functions. It keeps their outputs in OUT, and writes a digest of each array, tensor, figure
+and graph into OUT/digests.json. Dates, durations, versions and progress text are left out. `--real`
+adds real scans. Its FOLDER has semantickitti/ and nuscenes/ in the layout of their benchmarks, and
+formats/ with scan files of other formats.
 
-`compare` prints what differs between two such folders, by how much if they still hold the files,
-and exits with 1 if anything does. Both must come from one machine and the same libraries.
+`compare` prints the differences between two such folders, and their size if the files still exist.
+It exits with 1 if there are any. Both folders must come from one machine and the same libraries.
 
-`make` takes about eleven minutes on one core, two of them for the real scans.
+`make` takes about eleven minutes on one core, and two of them are for the real scans.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ if TYPE_CHECKING:
     from amvnet.models.methods import MethodName
 
 DIGESTS = "digests.json"
-LOG = "log.txt"  # what the commands say
+LOG = "log.txt"  # the file with the lines that the commands print
 REAL = "real"  # a link to the real scans, so that no output names their place
-CACHE = "cache"  # of exported networks
-LAS_DATE = slice(90, 94)  # of the header: day of the year and year, two bytes each
+CACHE = "cache"  # the folder of exported networks
+LAS_DATE = slice(90, 94)  # bytes of the header that hold the day and the year
 
-# Files with nothing to compare. Checkpoints and TensorBoard's curves hold times; the weights
-# of each stage have what matters of them.
+# Files that are not compared. Checkpoints and TensorBoard's curves hold times, and the weights of
+# each stage hold everything else that matters.
 LEFT_OUT = {REAL, CACHE, LOG, DIGESTS}
 LEFT_OUT_ANYWHERE = ("*.ckpt", "*.tfevents.*")
 
 # Entries of JSON and YAML files that differ between equal runs or between installations.
 VOLATILE = {"seconds", "made_by", "versions", "python"}
 
-# One thread: sums over several would depend on how they share the work.
+# Use one thread, because sums over several threads depend on how they share the work.
 SETTINGS = {
     "OMP_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "passive",
@@ -538,7 +538,7 @@ def differences(
 
 
 def how(old: Part, new: Part) -> str:
-    """Say by how much two parts differ."""
+    """Describe by how much two parts differ."""
     if isinstance(old, str) or isinstance(new, str):
         return f": {old[:60]} -> {new[:60]}"
     if (old.shape, old.dtype) != (new.shape, new.dtype):

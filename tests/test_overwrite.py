@@ -326,7 +326,7 @@ def test_real_scans_are_not_replaced_by_simulated_ones(
     mine.parent.mkdir(parents=True)
     mine.write_bytes(MINE)
     line = refusal(f"simulate {tmp_path} --sensor {sensor} --sequences 2 --scans 1")
-    assert "found another one" in line
+    assert "found something else" in line
     assert contents(tmp_path) == {name: MINE}
 
 
