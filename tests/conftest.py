@@ -18,7 +18,10 @@ LASERS = 16
 
 
 def _random_scan(count: int, seed: int = 0) -> Scan:
-    """Draw points all around the sensor, some outside any field of view, with labels and rings."""
+    """Return random points all around the sensor, with labels and rings.
+
+    Some points are outside any field of view.
+    """
     rng = np.random.default_rng(seed)
     xyz = rng.normal(0, (20, 20, 3), (count, 3))
     points = np.column_stack([xyz, rng.random(count)]).astype(np.float32)
@@ -28,7 +31,7 @@ def _random_scan(count: int, seed: int = 0) -> Scan:
 
 @pytest.fixture(scope="session", autouse=True)
 def on_cpu() -> Iterator[None]:
-    """Let `auto` be the CPU also where there is a GPU, whose sums are rounded otherwise."""
+    """Let `auto` be the CPU even if there is a GPU, because a GPU rounds sums differently."""
     choose = precision.choose_device
 
     def choose_cpu(name: str, engine: str = "torch") -> str:
@@ -47,7 +50,7 @@ def random_scan() -> Callable[..., Scan]:
 
 @pytest.fixture(scope="session")
 def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
-    """Submissions to both benchmarks, which no test may change."""
+    """Return submissions to both benchmarks, which no test may change."""
     return {name: make(tmp_path_factory.mktemp(name)) for name, make in MAKERS.items()}
 
 

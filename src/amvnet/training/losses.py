@@ -84,8 +84,9 @@ class Targets:
     def shares(self, dtype: torch.dtype) -> Tensor:
         """Return the (B, K) share of each class of each scan in the loss of the batch.
 
-        The loss is a mean over the scans, each of which has the mean over its classes. A class that
-        is absent from a scan has the share 0. The loss of a scan without points is 0.
+        The loss of the batch is the mean over its scans, and the loss of a scan is the mean over
+        its classes. A class that is absent from a scan has the share 0. The loss of a scan without
+        points is 0.
         """
         present = (self.counts > 0).to(dtype)
         return present / (present.sum(dim=1, keepdim=True).clamp_min(1) * len(present))
