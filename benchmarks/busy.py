@@ -85,7 +85,7 @@ def busy_processes(count: int) -> Iterator[None]:
 
 
 def environment(setting: str) -> dict[str, str]:
-    """Return this process's environment with nothing about threads but what the setting says."""
+    """Return this process's environment, in which only the setting concerns threads."""
     names = {*WAITING, "OMP_NUM_THREADS"}
     inherited = {key: value for key, value in os.environ.items() if key not in names}
     return {**inherited, **SETTINGS[setting]}
@@ -132,7 +132,7 @@ def time_command(command: str, data: Path, setting: str) -> float:
 
 
 def compare_commands(commands: list[str], scans: int, busy: list[int]) -> Table:
-    """Return a table of the commands' seconds as they are, and with passive waiting."""
+    """Return a table of the seconds of each command, by default and with passive waiting."""
     title = "seconds by default / with OMP_WAIT_POLICY=passive, and their ratio"
     table = Table("command", *[f"{count} busy" for count in busy], title=title)
     with TemporaryDirectory() as temporary:

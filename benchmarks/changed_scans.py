@@ -55,7 +55,7 @@ def turned(matrix: np.ndarray) -> Callable[[np.ndarray, np.ndarray], Cloud]:
 
 
 def tilted(pitch: float, roll: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
-    """Return a change that turns a scan by these degrees."""
+    """Return a change that turns a scan by some angles, degrees."""
     return turned(rotation_from_degrees(0, pitch, roll))
 
 
@@ -72,7 +72,7 @@ def scaled(factor: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
 
 
 def lifted(x: float, z: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
-    """Return a change that moves a scan, metres."""
+    """Return a change that moves a scan by some distances, metres."""
     return lambda xyz, intensity: Cloud(xyz + np.array([x, 0, z], xyz.dtype), intensity)
 
 
@@ -120,7 +120,7 @@ class Outcome:
 
 
 class Labeller:
-    """Labels normalised scans; the same scan only once, as many changes are undone exactly."""
+    """Labels normalised scans, and equal scans only once: many changes are undone exactly."""
 
     def __init__(self, weights: str) -> None:
         self.segmenter = amvnet.load(weights)
@@ -173,7 +173,7 @@ def cell(outcome: Outcome, unchanged: float) -> str:
 
 
 def main() -> None:
-    """Print the table, and below it what was said about the last scan."""
+    """Print the table, and below it the lines that were reported about the last scan."""
     parser = argparse.ArgumentParser()
     parser.add_argument("data")
     parser.add_argument("weights", nargs="?", default="sim-hdl64e")
@@ -214,7 +214,7 @@ def main() -> None:
 
 
 def name_option(options: dict[str, Any]) -> str:
-    """Return options as they are written on the command line."""
+    """Return the text of some options on the command line."""
     words = []
     for key, value in options.items():
         text = ",".join(f"{number:g}" for number in value) if isinstance(value, tuple) else value

@@ -84,7 +84,7 @@ def compare(root: Path, bucket: Bucket, scans: int, workers: int) -> None:
 
 
 def print_costs(few: tuple[int, float, float], many: tuple[int, float, float]) -> None:
-    """Print what a run takes at its start, and what each scan takes.
+    """Print the time that a run takes at its start, and the time of each scan.
 
     Args:
         few, many: the number of scans, and the seconds of `predict` and of `fleet`.

@@ -60,12 +60,12 @@ TINY = ModelConfig(
     PolarNetConfig(point_widths=(8, 8), pillar=8, widths=(8, 8)),
 )
 SIZES = {"paper": "semantickitti", "compact": "semantickitti-compact"}
-UNCERTAIN = 0.1  # share of the points, the paper's
-WARM_UP = 3  # runs that do not count; the first one captures the graphs
-# Of training
-STEP = 8  # scans
+UNCERTAIN = 0.1  # share of uncertain points, as in the paper
+WARM_UP = 3  # number of runs that do not count; the first one captures the graphs
+# Sizes of the training.
+STEP = 8  # number of scans in a step
 WORKERS = 6
-EPOCHS = (1, 3)  # of two runs, whose difference in time is measured
+EPOCHS = (1, 3)  # numbers of epochs of two runs, whose difference in time is measured
 
 
 class Options(argparse.Namespace):
@@ -78,7 +78,7 @@ class Options(argparse.Namespace):
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure, and print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -112,7 +112,7 @@ def main() -> None:
 
 
 def untrained(recipe: Recipe) -> Weights:
-    """Return random weights of a recipe's sizes."""
+    """Return random weights with the sizes of a recipe."""
     taxonomy = TAXONOMIES[recipe.taxonomy]
     model = build_amvnet(recipe.model, taxonomy.size)
     tensors: dict[str, torch.Tensor] = {}
@@ -213,7 +213,7 @@ def time_batch(segmenter: Segmenter, scans: Sequence[Scan], options: Options) ->
 
 
 def time_stages(segmenter: Segmenter, scan: Scan, options: Options) -> dict[str, float]:
-    """Return the median milliseconds of each stage, one after the other."""
+    """Return the median time of each stage, milliseconds, in the order of the stages."""
     timings = []
     for _ in range(WARM_UP + options.runs):
         timings.append(run_once(segmenter, read=lambda: scan, write=lambda labels: None))
@@ -240,7 +240,7 @@ def count_waits(segmenter: Segmenter, scan: Scan) -> Counter[str]:
 
 
 def measure_predict(size: str, weights: Weights, folder: Path, options: Options) -> None:
-    """Print the scans a second of `predict` from disk, beyond its start."""
+    """Print the scans per second of `predict` from disk, without its start."""
     path = save(weights, folder / f"{size}.safetensors")
     city = folder / "city"
     scans = len(list(city.glob("sequences/*/velodyne/*")))
@@ -257,7 +257,7 @@ def measure_predict(size: str, weights: Weights, folder: Path, options: Options)
 
 
 def measure_training(folder: Path, options: Options) -> None:
-    """Print the scans a second of training with loaders, beyond the first epoch."""
+    """Print the scans per second of training with loaders, without the first epoch."""
     batch, workers, epochs = (2, 0, (1, 2)) if options.quick else (STEP, WORKERS, EPOCHS)
     names = ("rv",) if options.quick else ("rv", "bev")
     accelerator = "cpu" if options.device == "cpu" else "gpu"
@@ -302,7 +302,7 @@ def rate_of(count: int, seconds: float) -> str:
 
 
 def median_seconds(work: Callable[[], object], options: Options) -> float:
-    """Return the median time of some runs, after others that only warm up."""
+    """Return the median time of some runs, after runs that only warm up."""
     times = []
     for _ in range(WARM_UP + options.runs):
         started = time.perf_counter()

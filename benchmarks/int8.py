@@ -71,7 +71,7 @@ class Runner(OnnxSegmenter):
 
 
 def race(float32: Callable[[], Any], int8: Callable[[], Any]) -> tuple[float, float]:
-    """Return the median milliseconds of both, run by turns, after runs that only warm up."""
+    """Return the median times of both, milliseconds. They run in turns, after runs that warm up."""
     times: tuple[list[float], list[float]] = ([], [])
     for _ in range(WARM_UP + RUNS):
         for call, milliseconds in zip((float32, int8), times, strict=True):

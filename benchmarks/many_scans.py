@@ -80,7 +80,7 @@ def predict_rate(folder: Path, engine: str, at_once: int) -> tuple[float, int]:
 
 
 def networks_rate(folder: Path, engine: str, at_once: int) -> float:
-    """Return what `time_networks` does, measured in a process of its own."""
+    """Return the rate of `time_networks`, measured in another process."""
     command = [sys.executable, __file__, str(folder), "--networks", "--engines", engine]
     command += ["--at-once", str(at_once)]
     output = subprocess.run(command, check=True, capture_output=True, text=True, env=SLEEPING)
@@ -89,7 +89,7 @@ def networks_rate(folder: Path, engine: str, at_once: int) -> float:
 
 @torch.inference_mode()
 def time_networks(paths: list[Path], engine: str, at_once: int) -> float:
-    """Return how many scans per second the two networks score, once these are projected."""
+    """Return the number of projected scans per second that the two networks score."""
     segmenter = load(WEIGHTS, engine=engine)  # type: ignore[arg-type]
     model = segmenter.model
     views = [model.project(segmenter.batch([read_scan(path)])) for path in paths]

@@ -174,7 +174,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--engines", default="torch")
-    parser.add_argument("--short", action="store_true")  # the engines alone
+    parser.add_argument("--short", action="store_true")  # measure only the engines
     parser.add_argument("--variant")  # to measure in this process; for `run_variant`
     options = parser.parse_args()
 
@@ -217,7 +217,7 @@ def compare(options: argparse.Namespace, scan: Path) -> None:
 def run_variant(
     variant: str, engine: str, scan: Path, options: argparse.Namespace
 ) -> dict[str, float]:
-    """Run `measure` in a process of its own."""
+    """Run `measure` in another process."""
     command = [sys.executable, __file__, "--scan", str(scan), "--runs", str(options.runs)]
     command += ["--variant", variant, "--engines", engine]
 

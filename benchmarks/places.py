@@ -56,7 +56,7 @@ def score(
 
 
 def plain(f: np.ndarray, g: np.ndarray, bev: float) -> np.ndarray:
-    """Return scores (N, K) of the ensemble as it would be without calibration."""
+    """Return the scores (N, K) that the ensemble would have without calibration."""
     return f ** (1 / (2 - 2 * bev)) * g ** (1 / (2 * bev))
 
 

@@ -59,8 +59,8 @@ VOLATILE = {"seconds", "made_by", "versions", "python"}
 SETTINGS = {
     "OMP_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "passive",
-    "COLUMNS": "10000",  # no option's help is broken into lines
-    "PYTHONSAFEPATH": "1",  # no folder of OUT is taken for a package
+    "COLUMNS": "10000",  # so that the help of each option is one line
+    "PYTHONSAFEPATH": "1",  # so that no folder of OUT is taken for a package
 }
 
 METHODS: tuple[MethodName, ...] = ("rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet")
@@ -265,7 +265,7 @@ class Runner:
             self.environment["PYTHONPATH"] = os.pathsep.join(map(os.path.abspath, paths))
 
     def __call__(self, *words: str) -> str:
-        """Run a program, print its CPU time and, if it fails, why; return its output."""
+        """Run a program, and return its output. Print its CPU time, and the reason if it fails."""
         shown = shlex.join([Path(words[0]).name, *words[1:]]).removeprefix("-m ")
         started = cpu_seconds()
         done = subprocess.run(
@@ -294,14 +294,14 @@ class Runner:
 
 
 def cpu_seconds() -> float:
-    """Return the CPU time of the programs so far; unlike time, it leaves out what others run."""
+    """Return the CPU time of the programs so far. Other programs do not affect it."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def use_library() -> None:
-    """Save what the public functions return, in the folder `library`."""
-    import amvnet  # here alone: `make` and `compare` need none
+    """Save the results of the public functions in the folder `library`."""
+    import amvnet  # only here, because `make` and `compare` do not need it
 
     folder = Path("library")
     folder.mkdir()
@@ -334,7 +334,7 @@ def save_segmentation(path: Path, result: Any) -> None:
 
 
 def files_to_digest(out: Path) -> list[str]:
-    """List the files below a folder that are compared, relative to it."""
+    """Return the compared files below a folder, relative to it."""
     files: list[str] = []
     for path in sorted(out.rglob("*")):
         name = path.relative_to(out)
@@ -345,7 +345,7 @@ def files_to_digest(out: Path) -> list[str]:
 
 
 def digest(part: Part) -> str:
-    """Return the SHA-256 of a part of a file; of an array also by its type and shape."""
+    """Return the SHA-256 of a part of a file. The digest of an array covers its type and shape."""
     if isinstance(part, str):
         return hashlib.sha256(part.encode()).hexdigest()
     head = f"{part.dtype.str} {part.shape} ".encode()
@@ -353,7 +353,7 @@ def digest(part: Part) -> str:
 
 
 def read_parts(path: Path) -> dict[str, Part]:
-    """Read what is compared of a file: its arrays, its figures, or all of its bytes."""
+    """Read the compared parts of a file: its arrays, its figures, or all of its bytes."""
     read = READERS.get(path.suffix, read_bytes)
     return read(path)
 
@@ -408,7 +408,7 @@ def read_yaml(path: Path) -> dict[str, Part]:
 
 
 def flatten(tree: Any, prefix: str = "") -> dict[str, Part]:
-    """Return the leaves of nested dictionaries by their path, as JSON; lists count as leaves."""
+    """Return the leaves of nested dictionaries as JSON, by their paths. Lists count as leaves."""
     if not isinstance(tree, dict):
         return {prefix.removesuffix("."): json.dumps(tree)}
 
@@ -465,7 +465,7 @@ def read_archive(path: Path) -> dict[str, Part]:
 
 
 def read_graph(path: Path) -> dict[str, Part]:
-    """Read an ONNX file: its bytes, and to tell why they differ its operators and its tensors."""
+    """Read the bytes of an ONNX file, and its operators and tensors, which explain differences."""
     import onnx
 
     graph = onnx.load(path).graph
@@ -496,7 +496,7 @@ READERS: dict[str, Callable[[Path], dict[str, Part]]] = {
 
 
 def compare(before: Path, after: Path) -> int:
-    """Print what differs between the results in two folders; return 1 if anything does, else 0."""
+    """Print the differences between the results in two folders; return 1 if there are any."""
     old = json.loads((before / DIGESTS).read_text())
     new = json.loads((after / DIGESTS).read_text())
     paths = sorted(old.keys() | new.keys())
