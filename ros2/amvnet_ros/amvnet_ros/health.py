@@ -93,7 +93,7 @@ class Health:
             self._refused += 1
 
     def report(self, seconds: float) -> Report:
-        """Return what happened since the last report, and begin a new period.
+        """Return the report on the time since the last report, and begin a new period.
 
         Args:
             seconds: the time since the last report.

@@ -28,7 +28,7 @@ LARGEST_MEMORY = 200_000_000
 
 @dataclass(frozen=True)
 class Contents:
-    """What a labelled scan holds.
+    """The contents of a labelled scan.
 
     Attributes:
         valid: the number of valid points (`Scan.valid`).
@@ -41,7 +41,7 @@ class Contents:
 
 @dataclass
 class UnknownId:
-    """How often a raw id occurs that is neither in a class nor ignored.
+    """The occurrences of a raw id that is neither in a class nor ignored.
 
     Attributes:
         points: the number of points with this id.
@@ -56,7 +56,7 @@ class UnknownId:
 
 @dataclass
 class SplitReport:
-    """What the scans of a split hold.
+    """The contents of the scans of a split.
 
     Attributes:
         points: (K + 1,) the number of points by train id.
@@ -99,7 +99,7 @@ class SplitReport:
 
 @dataclass(frozen=True)
 class Report:
-    """What the labelled scans of a dataset hold, by split.
+    """The contents of the labelled scans of a dataset, by split.
 
     Attributes:
         spec: the text with which the dataset is opened.
@@ -125,12 +125,12 @@ class Report:
 
     @property
     def broken(self) -> dict[str, str]:
-        """Messages about scans that cannot be read, by the name of the scan."""
+        """The messages about scans that cannot be read, by the name of the scan."""
         return {name: text for split in self.splits.values() for name, text in split.broken.items()}
 
     @property
     def unknown(self) -> dict[int, UnknownId]:
-        """Raw ids that are neither in a class nor ignored, in all splits."""
+        """The raw ids that are neither in a class nor ignored, over all splits."""
         total: dict[int, UnknownId] = {}
         for split in self.splits.values():
             for raw_id, entry in split.unknown.items():
@@ -244,7 +244,7 @@ def _find_contents(
     progress: Progress,
     processes: Processes,
 ) -> dict[str, Contents | str]:
-    """Return what scans hold, or a message about a broken scan, by the name of the scan.
+    """Return the contents of scans, or the message about a broken scan, by the name of the scan.
 
     Args:
         records: labelled scans by name.
@@ -281,7 +281,7 @@ def _advice(taxonomy: Taxonomy) -> str:
 def _read_all(
     dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
 ) -> dict[str, Contents | str]:
-    """Return what scans hold, or a message about a broken scan, by the name of the scan."""
+    """Return the contents of scans, or the message about a broken scan, by the name of the scan."""
 
     def read(record: ScanRecord) -> Contents | str:
         try:

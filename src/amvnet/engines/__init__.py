@@ -1,1 +1,1 @@
-"""What runs the two networks: torch or ONNX Runtime."""
+"""The engines that run the two networks: torch and ONNX Runtime."""

@@ -1,4 +1,4 @@
-"""What a segmenter needs of an engine, which runs the two networks."""
+"""The base class of the engines, which run the two networks for a segmenter."""
 
 from __future__ import annotations
 

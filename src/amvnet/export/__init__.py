@@ -1,1 +1,1 @@
-"""Networks for other runtimes: ONNX and int8 graphs, and the cache of the engines."""
+"""Export the networks for other runtimes: ONNX and int8 graphs, and their cache."""

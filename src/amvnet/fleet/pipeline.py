@@ -355,7 +355,7 @@ class Worker:
         self.work = kind(*ray.get(arguments))
 
     def __call__(self, batch: pa.Table) -> pa.Table:
-        """Return what the worker makes of a table of scans."""
+        """Return the table that the worker makes of a table of scans."""
         return self.work(batch)
 
 

@@ -39,7 +39,7 @@ DRIVES_SCHEMA = pa.schema(
     {
         "drive": pa.string(),
         "assumed": pa.string(),
-        "height": pa.float64(),  # of the sensor above the ground, metres
+        "height": pa.float64(),  # the height of the sensor over the ground, metres
         "pitch": pa.float64(),  # the rotation that levels the scans, degrees
         "roll": pa.float64(),  # the rotation that levels the scans, degrees
         "estimates": pa.string(),  # all measurements, as JSON

@@ -1,1 +1,1 @@
-"""From scans to labels: the segmenter, the late fusion and the commands' pipeline."""
+"""Label scans: the segmenter, the late fusion, and the pipeline of the commands."""

@@ -129,7 +129,7 @@ def fuse(
 
 
 class Fused(NamedTuple):
-    """What `fuse_files` has done.
+    """The result of `fuse_files`.
 
     Attributes:
         files: the number of label files.

@@ -29,7 +29,7 @@ from amvnet.sensors.normalise import Normaliser
 
 @dataclass(frozen=True)
 class ScanOptions:
-    """Which scans of the inputs to use.
+    """The choice of scans from the inputs.
 
     Attributes:
         sequences: the sequences or scenes to use of datasets; by default the sequences of `split`.

@@ -42,7 +42,7 @@ DIGEST_LENGTH = 16  # the hexadecimal digits of a digest in the journal
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What is written for each scan.
+    """The choice of files that are written for each scan.
 
     Attributes:
         folder: the folder of predictions.

@@ -29,7 +29,7 @@ UNKNOWN_SENSOR = Sensor()
 
 @dataclass(frozen=True)
 class LabellingRequest(Checked):
-    """All that the label files of a scan depend on, apart from the scan and its recording.
+    """A request for labels: it holds all that label files depend on, except the scans themselves.
 
     Attributes:
         weights: trained weights.

@@ -28,7 +28,7 @@ UNUSUAL_ODDS = 5.0
 
 @dataclass(frozen=True)
 class Verdict:
-    """How sure the labels of some scans are; it prints as one line.
+    """The verdict on how sure the labels of some scans are; it prints as one line.
 
     Attributes:
         share: the share of the points that are uncertain, in [0, 1].
@@ -170,7 +170,7 @@ class Segmentation:
 
     @property
     def verdict(self) -> Verdict | None:
-        """How sure the labels are, compared with the scans that the weights were validated on.
+        """The verdict on how sure the labels are, compared with the validation of the weights.
 
         None for a single network, and for the late fusion alone.
         """
@@ -181,7 +181,7 @@ class Segmentation:
 
     @property
     def assumed(self) -> str:
-        """What was assumed of the sensor to normalise the scan; empty if it was in memory."""
+        """The assumptions about the sensor for normalising the scan; empty if it was in memory."""
         return "" if self.origin is None else self.origin.assumed
 
     def save(self, path: Path | str) -> Path:

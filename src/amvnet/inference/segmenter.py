@@ -1,4 +1,4 @@
-"""Points in, labels out: a NumPy interface to an engine."""
+"""The segmenter, which turns scans into labels by an engine."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Segmenter:
     def usual_uncertain(self) -> float | None:
         """The share of uncertain points in the validation, in [0, 1].
 
-        None if the file does not state it for this tau.
+        None if the engine has another tau than the weights.
         """
         return self.weights.usual_uncertain_at(self.engine.tau)
 

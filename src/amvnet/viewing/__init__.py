@@ -1,1 +1,1 @@
-"""Scans in 3D, on a page for the browser."""
+"""Show scans in 3D, on a page for the browser."""

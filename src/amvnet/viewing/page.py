@@ -235,7 +235,7 @@ def fill_page(
 
 
 def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, Any]:
-    """Return what the page's scripts need to know about all scans, for the page's JSON."""
+    """Return the values that the page's scripts need for all scans, for the page's JSON."""
     present: set[int] = set()
     planes: set[str] = set()
     for scan in packed:

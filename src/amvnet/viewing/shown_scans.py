@@ -30,7 +30,7 @@ UNSCORED = (40, 47, 58)
 
 @dataclass(frozen=True)
 class ShownScan:
-    """One scan and what is known about its N points.
+    """One scan, with all that the page can show of its N points.
 
     Attributes:
         name: the scan's short name, for people.

@@ -1,4 +1,4 @@
-"""Weights files, the hub and model cards.
+"""Read, write and share weights: weights files, the hub and model cards.
 
 `load` and `Weights` are imported on first use, so that importing this package is fast.
 """

@@ -39,7 +39,7 @@ COLUMN_NAMES: Names = {
     ),
     "ring": ("ring", "rings", "channel", "laser_id", "laser", "scalar_ring"),
 }
-OPTIONAL = ("intensity", "ring")  # keys of columns that a file may lack
+OPTIONAL = ("intensity", "ring")  # the keys of columns that a file may lack
 
 
 @dataclass(frozen=True)

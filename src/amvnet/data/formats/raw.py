@@ -12,8 +12,8 @@ from amvnet.data.formats.cloud import MOST_RINGS, Cloud, check_point_count
 from amvnet.data.formats.rows import ADVICE, NAMES, UNKNOWN, RowLayout, are_rings, named_cloud
 from amvnet.errors import InputError, readable
 
-KITTI_COLUMNS = 4  # x, y, z, intensity
-NUSCENES_COLUMNS = 5  # x, y, z, intensity 0..255, ring
+KITTI_COLUMNS = 4  # the number of columns: x, y, z, intensity
+NUSCENES_COLUMNS = 5  # the number of columns: x, y, z, intensity in 0..255, ring
 NUSCENES_ENDING = ".pcd.bin"
 FULL_INTENSITY = 255.0
 XYZ_BYTES = 12  # the size of a row that holds only x, y and z as float32, bytes
