@@ -114,11 +114,11 @@ def _moving_mesh(site: Site, course: Course, index: int, time: float) -> Mesh:
     ego = np.array([course.pose_at(index)[:2]])
     bodies = []
     for mover in site.movers:
-        x = mover.place(site.ground, time)
+        x = mover.street_x(site.ground, time)
         if abs(x - ego_x) < SIGHT_DISTANCE and site.ground.is_street(x, 2.0):
             pose = mover.pose_at(site.ground, time)
             if not covers(mover.mesh, pose, ego, MOVING_CLEARANCE):
-                bodies.append(mover.at(site.ground, time))
+                bodies.append(mover.mesh_at(site.ground, time))
     return join(*bodies)
 
 

@@ -130,14 +130,14 @@ class SemanticKittiLayout:
     times: list[float] = field(default_factory=list)
 
     @staticmethod
-    def place(out: Path, number: int) -> tuple[Path, bool]:
+    def owned_path(out: Path, number: int) -> tuple[Path, bool]:
         """Return the folder of a sequence, and False: other sequences have other folders."""
         return out / "sequences" / f"{number:02d}", False
 
     @property
     def folder(self) -> Path:
         """The folder of the sequence."""
-        return self.place(self.out, self.number)[0]
+        return self.owned_path(self.out, self.number)[0]
 
     def write_scan(self, index: int, scan: SimulatedScan) -> None:
         """Write one scan and its labels."""
@@ -175,7 +175,7 @@ class NuScenesLayout:
     rows: list[Row] = field(default_factory=list)
 
     @staticmethod
-    def place(out: Path, number: int) -> tuple[Path, bool]:
+    def owned_path(out: Path, number: int) -> tuple[Path, bool]:
         """Return the folder of the tables, and True: all sequences share it."""
         return out / NUSCENES_VERSION, True
 
@@ -238,7 +238,7 @@ class RobotLayout:
     number: int
 
     @staticmethod
-    def place(out: Path, number: int) -> tuple[Path, bool]:
+    def owned_path(out: Path, number: int) -> tuple[Path, bool]:
         """Return the folder of a site and False, or the file about all sites and True.
 
         The file is returned if the folder does not exist yet.

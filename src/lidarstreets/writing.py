@@ -108,7 +108,7 @@ def simulate(
     for number in range(first_sequence, first_sequence + sequences):
         sequence = Sequence(out, sensor, number, scans, seed)
         if not _is_complete(sequence):
-            _check_own(sequence)
+            _check_is_simulated(sequence)
             missing.append(sequence)
 
     done = scans * (sequences - len(missing))
@@ -142,9 +142,9 @@ def _is_complete(sequence: Sequence) -> bool:
     return True
 
 
-def _check_own(sequence: Sequence) -> None:
+def _check_is_simulated(sequence: Sequence) -> None:
     """Raise if the folder of a sequence has files that were not simulated, such as real scans."""
-    place, belongs_to_all = LAYOUTS[sensor_of(sequence.sensor).layout].place(
+    place, belongs_to_all = LAYOUTS[sensor_of(sequence.sensor).layout].owned_path(
         sequence.out, sequence.number
     )
     begun = (sequence.out / MARKER_FOLDER).glob("*") if belongs_to_all else [sequence.begun]

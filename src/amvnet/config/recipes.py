@@ -89,7 +89,7 @@ def _find(name_or_path: str) -> Path:
             + did_you_mean(
                 name_or_path,
                 recipe_names(),
-                advice=f"the built-in ones are {', '.join(recipe_names())}",
+                advice=f"the built-in recipes are {', '.join(recipe_names())}",
             )
         )
     return path

@@ -12,7 +12,7 @@ from amvnet.models.upsampled_conv import apply_to_joined
 from amvnet.models.views.range_view import CHANNELS
 
 FIRST_DECODED_STAGE = 1  # index of the first stage that the decoder uses; its width stride is 4
-RECURRENT_STAGES = 2  # number of stages, the last ones, that a GRU follows
+RECURRENT_STAGES = 2  # number of the last stages that a GRU follows
 
 
 class RangeNet(nn.Module):

@@ -191,7 +191,7 @@ def _levelling(up: np.ndarray) -> tuple[float, float]:
 def median_frame(frames: Sequence[Frame]) -> Frame:
     """Return the frame of a recording from the frames of its first scans.
 
-    Unit and axes are the most frequent ones; angles and height are medians.
+    The unit and the axes are the most frequent of all; the angles and the height are medians.
     """
     unit = mode(frame.unit for frame in frames)
     axes = mode(frame.axes for frame in frames)

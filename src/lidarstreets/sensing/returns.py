@@ -15,7 +15,7 @@ from lidarstreets.sensing.sensors import LidarModel
 FADING_POWER = 3.0
 # Range within which lasers that are focused far away lose brightness, metres.
 NEAR_RANGE = 9.0
-# Scale of the logistic curve between brightnesses that are reported as 0 and larger ones.
+# Scale of the logistic curve that decides, by its brightness, whether a return is reported as 0.
 BRIGHTNESS_STEP = 0.02
 # Smallest and largest step in depth across which one pulse can return from in between, metres.
 MIN_MIXED_STEP = 0.3

@@ -34,18 +34,18 @@ class Mover:
     t: float
     speed: float
 
-    def place(self, ground: Ground, time: float) -> float:
+    def street_x(self, ground: Ground, time: float) -> float:
         """Return its x along the street at a time in seconds."""
         return (self.x + self.speed * time) % ground.length
 
-    def at(self, ground: Ground, time: float) -> Mesh:
+    def mesh_at(self, ground: Ground, time: float) -> Mesh:
         """Return the body where it is at a time in seconds."""
         x, y, yaw = self.pose_at(ground, time)
         return place(self.mesh, x, y, float(ground.height(x, y)), yaw)
 
     def pose_at(self, ground: Ground, time: float) -> tuple[float, float, float]:
         """Return its (x, y, yaw) at a time in seconds, in metres and radians."""
-        x, y, yaw = ground.lane_pose(self.place(ground, time), self.t)
+        x, y, yaw = ground.lane_pose(self.street_x(ground, time), self.t)
         if self.speed < 0:
             yaw += np.pi
         return x, y, yaw

@@ -42,9 +42,9 @@ def test_vehicles_of_one_lane_do_not_overlap(seed: int) -> None:
     for t, _ in site.ground.style.lanes:
         lane = [mover for mover in movers if abs(mover.t - t) < 0.9]
         for time in (0.0, 3.0, 11.0):
-            order = sorted(lane, key=lambda mover: mover.place(site.ground, time))
+            order = sorted(lane, key=lambda mover: mover.street_x(site.ground, time))
             for first, second in pairwise(order):
-                gap = second.place(site.ground, time) - first.place(site.ground, time)
+                gap = second.street_x(site.ground, time) - first.street_x(site.ground, time)
                 lengths = footprint(first.mesh)[1][0] + footprint(second.mesh)[1][0]
                 assert gap > 0.9 * lengths
 
