@@ -37,7 +37,7 @@ from lidarstreets.layouts import write_whole
 
 from fixtures.commands import fails, refusal, run_cli
 from fixtures.datasets import MAKERS, make_nuscenes
-from fixtures.tiny import fresh_weights, street, write_recipe
+from fixtures.tiny import fresh_weights, street, without, write_recipe
 
 COUNT = 7  # points of a scan
 PRECIOUS = b"hours of work"
@@ -302,7 +302,7 @@ HOSTILE = "../../../victim/precious"
 # Commands that write files with names of their own, whatever the data say.
 WRITERS = (
     "view {base}/data/own.yaml --weights {base}/data/w.safetensors --html {base}/out/page.html",
-    "export --weights {base}/data/w.safetensors --out {base}/out",
+    "export --weights {base}/data/bev.safetensors --out {base}/out",
     "train {base}/data/r.yaml --data {base}/data/own.yaml --stage rv --out {base}/out",
     "rank {base}/data/own.yaml --weights {base}/data/w.safetensors --out {base}/out/r.csv",
     "evaluate {base}/data/own.yaml --weights {base}/data/w.safetensors --pictures {base}/out",
@@ -328,7 +328,9 @@ def make_hostile(folder: Path) -> None:
     (folder / "own.yaml").write_text(yaml.safe_dump(description))
     write_recipe(folder / "r.yaml", training={"rv": {"epochs": 1}})
     taxonomy = open_dataset(str(folder / "own.yaml")).taxonomy
-    save(replace(fresh_weights(taxonomy), sensor=HOSTILE), folder / "w.safetensors")
+    weights = replace(fresh_weights(taxonomy), sensor=HOSTILE)
+    save(weights, folder / "w.safetensors")
+    save(without(weights, "range_net", "point_head"), folder / "bev.safetensors")
 
 
 @pytest.mark.parametrize("command", WRITERS, ids=lambda command: command.split()[0])

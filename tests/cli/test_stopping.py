@@ -25,6 +25,7 @@ from fixtures.scan_writers import some_points, write_las
 from fixtures.tiny import fresh_weights, street
 
 SOON = 5  # seconds on a busy machine; a second on an idle one
+SCANS = 24  # more than are labelled before a signal arrives
 
 Run = Callable[[str, Sequence[str]], None]
 
@@ -161,15 +162,22 @@ def test_a_signal_during_an_import_raises_nothing_in_it() -> None:
     assert (done.returncode, done.stderr) == (143, "amvnet: stopped\n")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_predict_goes_on(number: int, tmp_path: Path) -> None:
-    save(fresh_weights(), tmp_path / "w.safetensors")
-    (tmp_path / "scans").mkdir()
-    for index in range(40):
-        street(index, 20_000)[0].tofile(tmp_path / f"scans/{index:02d}.bin")
-    command = ["predict", tmp_path / "scans", "--weights", tmp_path / "w.safetensors", "--out"]
-    assert run_cli(*command, tmp_path / "whole") == (0, "")
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights, scans that take seconds, and the labels of `predict`."""
+    root = tmp_path_factory.mktemp("world")
+    save(fresh_weights(), root / "w.safetensors")
+    (root / "scans").mkdir()
+    for index in range(SCANS):
+        street(index, 20_000)[0].tofile(root / f"scans/{index:02d}.bin")
+    arguments = ["predict", root / "scans", "--weights", root / "w.safetensors"]
+    assert run_cli(*arguments, "--out", root / "whole") == (0, "")
+    return root
 
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_predict_goes_on(number: int, world: Path, tmp_path: Path) -> None:
+    command = ["predict", world / "scans", "--weights", world / "w.safetensors", "--out"]
     words = [sys.executable, "-m", "amvnet", *map(str, command), str(tmp_path / "parts")]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
         while not list(tmp_path.glob("parts/[!.]*.label")) and process.poll() is None:
@@ -178,11 +186,11 @@ def test_a_stopped_predict_goes_on(number: int, tmp_path: Path) -> None:
         assert process.wait(60) == 128 + number
         assert process.stderr is not None
         assert process.stderr.read() == "amvnet: stopped; go on with --resume\n"
-    assert 0 < len(list(tmp_path.glob("parts/*.label"))) < 40
+    assert 0 < len(list(tmp_path.glob("parts/*.label"))) < SCANS
     assert not list(tmp_path.glob("parts/.*.part*"))
 
     assert run_cli(*command, tmp_path / "parts", "--resume") == (0, "")
-    for path in (tmp_path / "whole").glob("*.label"):
+    for path in (world / "whole").glob("*.label"):
         assert path.read_bytes() == (tmp_path / "parts" / path.name).read_bytes()
 
 

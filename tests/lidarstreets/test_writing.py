@@ -69,7 +69,7 @@ def run_on_two_processes(out: Path) -> subprocess.Popen[bytes]:
     options = ["--sequences", "2", "--scans", "1000", "--processes", "2"]
     parent = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, start_new_session=True)
     deadline = time.monotonic() + 60
-    while len(list((out / "sequences").glob("*/labels/000001.label"))) < 2:
+    while len(list((out / "sequences").glob("*/labels/000000.label"))) < 2:
         assert time.monotonic() < deadline
         time.sleep(0.05)
     return parent

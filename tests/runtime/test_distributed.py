@@ -6,7 +6,6 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,23 +34,48 @@ TRAINING = {
 }
 
 
-def torchrun(*arguments: object, count: int = 2) -> subprocess.CompletedProcess[str]:
-    """Run the command line in some processes on this machine."""
-    launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+def output_of_torchrun(*arguments: object) -> str:
+    """Run the command line in two processes; return what they print."""
+    launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command = [sys.executable, *launcher, "-m", "amvnet", *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
-def one_process(*arguments: object) -> int:
-    """Run the command line in this process; return its exit code."""
-    code, _ = run_cli(*arguments)
-    return code
+def slurm(*arguments: object) -> list[tuple[int, str]]:
+    """Run the command line in two processes as srun does; return exit codes and what is printed."""
+    job = {
+        "SLURM_JOB_ID": "4711",
+        "SLURM_JOB_NAME": "amvnet",
+        "SLURM_NTASKS": "2",
+        "SLURM_NTASKS_PER_NODE": "2",
+        "SLURM_NNODES": "1",
+        "SLURM_NODEID": "0",
+        "SLURM_NODELIST": "127.0.0.1",
+        "SLURM_STEP_ID": "0",
+        "MASTER_PORT": str(free_port()),
+        "OMP_NUM_THREADS": "1",
+    }
+    words = [sys.executable, "-m", "amvnet", *map(str, arguments)]
+    processes = []
+    for rank in ("0", "1"):
+        environment = {**os.environ, **job, "SLURM_PROCID": rank, "SLURM_LOCALID": rank}
+        process = subprocess.Popen(
+            words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        processes.append(process)
+    outputs = [process.communicate()[0] for process in processes]
+    return [(process.returncode, text) for process, text in zip(processes, outputs, strict=True)]
 
 
-def two_processes(*arguments: object) -> int:
-    """Run the command line in two processes; return their exit code."""
-    return torchrun(*arguments).returncode
+def output_of_srun(*arguments: object) -> str:
+    """Run the command line in two processes; return what the first prints, and alone prints."""
+    results = slurm(*arguments)
+    assert [code for code, _ in results] == [0, 0], results
+    assert results[1][1] == ""
+    return results[0][1]
 
 
 def largest_difference(a: Weights, b: Weights) -> float:
@@ -89,62 +113,40 @@ def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
     return arguments
 
 
-@pytest.mark.parametrize("stage", ["rv", pytest.param("bev", marks=pytest.mark.slow), "head"])
-def test_two_processes_train_the_weights_of_one(world: Path, tmp_path: Path, stage: str) -> None:
-    result = torchrun(*train_arguments(world, tmp_path / "two", stage))
-    assert result.returncode == 0, result.stderr
+@pytest.mark.parametrize(
+    ("stage", "launcher"),
+    [
+        ("rv", "torchrun"),
+        pytest.param("bev", "torchrun", marks=pytest.mark.slow),
+        ("head", "srun"),
+        pytest.param("rv", "srun", marks=pytest.mark.slow),
+    ],
+)
+def test_two_processes_train_the_weights_of_one(
+    world: Path, tmp_path: Path, stage: str, launcher: str
+) -> None:
+    output_of = {"torchrun": output_of_torchrun, "srun": output_of_srun}[launcher]
+    printed = output_of(*train_arguments(world, tmp_path / "two", stage))
+    assert printed.count("epoch 2/") == 1  # only one of them prints
 
     weights = load(tmp_path / "two" / stage / "last.safetensors")
     expected = load(world / "run" / stage / "last.safetensors")
     assert largest_difference(weights, expected) < 1e-5
     part = weights.parts[0]
     assert weights.metrics[part] == pytest.approx(expected.metrics[part])
-    assert result.stdout.count("epoch 2/") == 1  # only one of them prints
-
-
-def slurm(command: Sequence[object]) -> list[tuple[int, str]]:
-    """Run a command in two processes as srun does; return exit codes and what is printed."""
-    job = {
-        "SLURM_JOB_ID": "4711",
-        "SLURM_JOB_NAME": "amvnet",
-        "SLURM_NTASKS": "2",
-        "SLURM_NTASKS_PER_NODE": "2",
-        "SLURM_NNODES": "1",
-        "SLURM_NODEID": "0",
-        "SLURM_NODELIST": "127.0.0.1",
-        "SLURM_STEP_ID": "0",
-        "MASTER_PORT": str(free_port()),
-        "OMP_NUM_THREADS": "1",
-    }
-    words = [sys.executable, *map(str, command)]
-    processes = []
-    for rank in ("0", "1"):
-        environment = {**os.environ, **job, "SLURM_PROCID": rank, "SLURM_LOCALID": rank}
-        process = subprocess.Popen(
-            words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-        processes.append(process)
-    outputs = [process.communicate()[0] for process in processes]
-    return [(process.returncode, text) for process, text in zip(processes, outputs, strict=True)]
-
-
-def test_processes_that_slurm_has_started_find_each_other(world: Path, tmp_path: Path) -> None:
-    results = slurm(["-m", "amvnet", *train_arguments(world, tmp_path / "two", "rv")])
-    assert [code for code, _ in results] == [0, 0], results
-    assert results[1][1] == ""
-
-    weights = load(tmp_path / "two/rv/last.safetensors")
-    assert largest_difference(weights, load(world / "run/rv/last.safetensors")) < 1e-5
 
 
 def test_processes_share_the_scans_of_evaluate(world: Path, tmp_path: Path) -> None:
     data = world / "data"
     weights = ["--weights", world / "run"]
-    for name, run in (("one", one_process), ("two", two_processes)):
+    for name in ("one", "two"):
         out = tmp_path / name
         written = ["--json", out / "all.json", "--pictures", out / "pictures"]
-        evaluated = ["--sequences", "08", *written]
-        assert run("evaluate", data, *weights, *evaluated) == 0
+        arguments = ["evaluate", data, *weights, "--sequences", "08", *written]
+        if name == "one":
+            assert run_cli(*arguments) == (0, "")
+        else:
+            output_of_srun(*arguments)
 
     names = files(tmp_path / "one")
     assert files(tmp_path / "two") == names
@@ -162,11 +164,13 @@ def test_work_that_cannot_be_shared_is_refused_in_one_line(
         "train": [world / "recipe.yaml", "--data", data, "--training.rv.batch", 3],
         "analyze": [data, "--weights", world / "run"],
     }
-    result = torchrun(command, *arguments[command], "--out", tmp_path / "out")
-    assert result.returncode != 0
+    results = slurm(command, *arguments[command], "--out", tmp_path / "out")
+    assert [code for code, _ in results] == [2, 2], results
 
-    lines = [line for line in result.stderr.splitlines() if line.startswith("amvnet: ")]
-    assert len(set(lines)) == 1, result.stderr
+    lines = [
+        line for _, text in results for line in text.splitlines() if line.startswith("amvnet: ")
+    ]
+    assert len(set(lines)) == 1, results
     assert "processes" in lines[0]
     assert not (tmp_path / "out").exists()
 

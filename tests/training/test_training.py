@@ -694,8 +694,7 @@ def test_a_killed_run_resumes_to_the_same_weights(
     kill_after_first_epoch(command, out / stage)
     assert not (out / stage / "done").exists(), "the run was over before it was killed"
 
-    resumed = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
-    assert resumed.returncode == 0, resumed.stderr
+    train(world, out, "--stage", stage, "--resume")
     weights = load(out / stage / "last.safetensors")
     assert not differing(weights, load(run / stage / "last.safetensors"))
 
@@ -714,7 +713,7 @@ def test_sigterm_ends_a_training_with_143_and_one_line_and_resume_goes_on(
     assert error == "amvnet: stopped; go on with --resume\n"
     assert "weights in" not in output
 
-    assert subprocess.run([*command, "--resume"], capture_output=True, check=False).returncode == 0
+    train(world, tmp_path / "run", "--stage", "rv", "--resume")
     resumed = load(tmp_path / "run/rv/last.safetensors")
     assert not differing(resumed, load(run / "rv/last.safetensors"))
 
@@ -743,19 +742,18 @@ def test_a_full_disk_stops_with_one_line_and_the_last_good_weights(
 ) -> None:
     """No file may exceed `room` bytes, which is what a full disk looks like to a program."""
     out = tmp_path / "run"
-    command = command_of(world, out, "rv")
-    kill_after_first_epoch(command, out / "rv")
+    train_interrupted("rv", 1, world, out, "--stage", "rv")
     before = load(out / "rv" / "last.safetensors")
 
-    limited = ["bash", "-c", f'ulimit -f {room // 1024 + 1}; exec "$@"', "-", *command, "--resume"]
+    command = [*command_of(world, out, "rv"), "--resume"]
+    limited = ["bash", "-c", f'ulimit -f {room // 1024 + 1}; exec "$@"', "-", *command]
     result = subprocess.run(limited, capture_output=True, text=True, check=False)
     assert result.returncode in (1, 2), result.stderr
     assert len(result.stderr.splitlines()) == 1, result.stderr
     assert not differing(load(out / "rv" / "last.safetensors"), before)
     assert not [name for name in files(out) if ".part" in name]
 
-    resumed = subprocess.run([*command, "--resume"], capture_output=True, check=False)
-    assert resumed.returncode == 0
+    train(world, out, "--stage", "rv", "--resume")
 
 
 def test_a_run_that_fails_prints_one_line_and_keeps_the_stages_before(
@@ -765,14 +763,12 @@ def test_a_run_that_fails_prints_one_line_and_keeps_the_stages_before(
     data = tmp_path / "data"
     shutil.copytree(world / "data", data)
     arguments = ["train", world / "recipe.yaml", "--data", data, "--out", tmp_path / "run"]
-    command = [sys.executable, "-m", "amvnet", *map(str, arguments)]
-    subprocess.run([*command, "--stage", "rv"], capture_output=True, check=True)
+    assert run_cli(*arguments, "--stage", "rv") == (0, "")
 
     # Read in the validation, after an epoch of training.
     (data / "sequences/08/labels/000001.label").write_bytes(b"1234")
-    result = subprocess.run(
-        [*command, "--stage", "bev"], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", "amvnet", *map(str, arguments), "--stage", "bev"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert "000001.label" in result.stderr
     assert len(result.stderr.splitlines()) == 1, result.stderr

@@ -173,10 +173,10 @@ def test_leaves_differ_less_in_brightness_than_they_used_to() -> None:
 
 @pytest.fixture(scope="module")
 def scans() -> list[SimulatedScan]:
-    """One scan of each of sixteen streets."""
+    """One scan of each of eight streets."""
     pytest.importorskip("embreex")
     scans: list[SimulatedScan] = []
-    for seed in range(16):
+    for seed in range(8):
         scans += drive_street(HDL64E, 1, np.random.SeedSequence((7, seed)))
     return scans
 
