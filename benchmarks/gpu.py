@@ -29,12 +29,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+import yaml
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from amvnet import load
 from amvnet import read as read_scan
 from amvnet.cli.main import main as amvnet
+from amvnet.config.nested import to_dict
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import (
     ModelConfig,
@@ -260,6 +262,10 @@ def measure_training(folder: Path, options: Options) -> None:
     """Print the scans per second of training with loaders, without the first epoch."""
     batch, workers, epochs = (2, 0, (1, 2)) if options.quick else (STEP, WORKERS, EPOCHS)
     names = ("rv",) if options.quick else ("rv", "bev")
+    recipe: Path | str = "simulated-compact"
+    if options.quick:
+        recipe = folder / "tiny.yaml"
+        recipe.write_text(yaml.safe_dump({"base": "simulated-compact", "model": to_dict(TINY)}))
     accelerator = "cpu" if options.device == "cpu" else "gpu"
 
     rows = []
@@ -268,7 +274,7 @@ def measure_training(folder: Path, options: Options) -> None:
         for count in epochs:
             seconds.append(
                 run_amvnet(
-                    *("train", "simulated-compact", "--data", folder / "city"),
+                    *("train", recipe, "--data", folder / "city"),
                     *("--out", folder / f"run-{stage}-{count}", "--stage", stage),
                     *("--train-sequences", "00,01,02", "--val-sequences", "03"),
                     *(f"--training.{stage}.epochs", count, f"--training.{stage}.batch", batch),
@@ -280,7 +286,7 @@ def measure_training(folder: Path, options: Options) -> None:
         scans = len(list((folder / "city").glob("sequences/0[012]/velodyne/*")))
         rows.append([stage, rate_of((epochs[1] - epochs[0]) * scans, seconds[1] - seconds[0])])
 
-    title = f"training of simulated-compact, {batch} scans a step, {workers} workers, validation"
+    title = f"training of {Path(recipe).stem}, {batch} scans a step, {workers} workers, validation"
     print_table(f"{title} included", ["network", "scans/s"], rows)
 
 
