@@ -87,3 +87,4 @@ def locked_bucket(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[s
     monkeypatch.setenv("HOME", str(tmp_path))  # without a file of credentials
     yield f"s3://locked-{server.server_port}"  # filesystems of buckets are kept
     server.shutdown()
+    server.server_close()
