@@ -85,19 +85,3 @@ def test_the_points_that_are_drawn_stand_for_all_uncertain_ones(tmp_path: Path) 
     stand_for = few[np.arange(len(few))][3]
     assert float(stand_for.sum()) == pytest.approx(len(everything))
     assert (everything[np.arange(len(everything))][3] == 1).all()
-
-
-def test_points_on_disk_are_not_disturbed_so_that_each_epoch_disturbs_them_anew(
-    tmp_path: Path,
-) -> None:
-    dataset = open_dataset(str(make_streets(tmp_path / "data", ("00",))))
-    records = dataset.records(["00"])
-    files = []
-    for disturb in (0.0, 1.0):
-        path = write_recipe(tmp_path / "r.yaml", training={"head": {"disturb": disturb}})
-        plan = Plan(load_recipe(str(path)), TrainingScans(dataset, records, []), tmp_path / "run")
-        points = PointGatherer(plan, fresh_weights()).gather(records, tmp_path / "points", views=1)
-        files.append(points.paths[0].read_bytes())
-
-    assert files[0]
-    assert files[0] == files[1]

@@ -495,15 +495,6 @@ def test_the_head_stage_leaves_the_networks_bitwise_unchanged(
     assert differing(before, after) == {"point_head"}
 
 
-def test_the_head_learns_from_disturbed_scores_if_asked_to(
-    world: Path, run: Path, tmp_path: Path
-) -> None:
-    options = ("--stage", "head", "--init", run, "--training.head.epochs", 1)
-    as_they_are = train(world, tmp_path / "plain", *options)
-    disturbed = train(world, tmp_path / "disturbed", *options, "--training.head.disturb", 0.5)
-    assert differing(as_they_are, disturbed) == {"point_head"}
-
-
 def test_a_head_may_learn_from_points_of_another_tau(
     world: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -351,7 +351,7 @@ class HeadTraining(Checked):
     """Largest cosine similarity of the points that the head learns from; 0: take the threshold of
     the model's assertion (open)."""
     disturb: Share = 0.0
-    """Probability of disturbing the scores of a network in a part of a batch (open)."""
+    """Probability of disturbing the scores of a network in a view of a scan (open)."""
     points: Points = 300_000
     """Largest number of uncertain points of all scans, which share it equally. Each point takes 1.3
     kB on disk (for 19 classes)."""

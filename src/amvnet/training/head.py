@@ -17,13 +17,7 @@ from amvnet.errors import InputError
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.point_head import PointHead
 from amvnet.sensors.intensity import trained_intensity
-from amvnet.training.head_points import (
-    HeadBatch,
-    HeadPoints,
-    PointGatherer,
-    PointSampler,
-    disturb_batch,
-)
+from amvnet.training.head_points import HeadBatch, HeadPoints, PointGatherer, PointSampler
 from amvnet.training.plan import Plan
 from amvnet.training.stage import Loaders, Stage, fit
 from amvnet.weights.file import UNCERTAIN, Weights
@@ -55,12 +49,6 @@ class HeadStage(Stage):
 
     def training_step(self, batch: HeadBatch, index: int) -> Tensor:
         point, rows, labels, _ = batch
-        chance = self.config.disturb
-        if chance > 0:
-            # `SeedBatches` has seeded torch for this batch.
-            rng = np.random.default_rng(torch.initial_seed())
-            scale = self.trained.config.position_scale
-            point, rows = disturb_batch(point, rows, scale, chance, rng)
         total_loss = F.cross_entropy(self.trained(point, rows), labels - 1, reduction="sum")
 
         # Lightning averages the gradients of all processes. The factor makes the loss the mean over

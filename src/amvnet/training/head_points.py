@@ -33,8 +33,6 @@ from amvnet.training.loaders import EpochOrder, Key, ScanSet, collate
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights
 
-DISTURBED_PARTS = 8  # of a batch, each with disturbances of its own
-
 # Takes a scan and the batch of its P valid points. Returns the probabilities f and g, (P, K).
 Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]
 
@@ -314,6 +312,11 @@ class PointGatherer:
         labels = labels.to(device)
 
         f, g = scorer(scans.records[key[1]], scan, batch)
+        if scans.augment is not None:
+            chance = self.plan.recipe.training.head.disturb
+            rng = np.random.default_rng([*seeds, 1])
+            f = disturb(f, batch.points, rng) if rng.random() < chance else f
+            g = disturb(g, batch.points, rng) if rng.random() < chance else g
         uncertain = assertion(f, g, batch.points) & (labels > 0)
         matrices = _ensemble_matrices(f, g, labels, uncertain)
 
@@ -348,42 +351,6 @@ class PointGatherer:
                 ("stands_for", np.float32),
             ]
         )
-
-
-def disturb_batch(
-    point: Tensor, rows: Tensor, position_scale: float, chance: float, rng: np.random.Generator
-) -> tuple[Tensor, Tensor]:
-    """Return the features of a batch, with the scores of both networks disturbed in places.
-
-    The batch is divided into `DISTURBED_PARTS` parts. In each part, the scores of each network are
-    disturbed with the probability `chance`, those of a point and of its neighbours alike.
-
-    A disturbance must not belong to a scan: the head would see the same few hundred disturbances in
-    each epoch, and learn them by heart.
-
-    Args:
-        point: (U, 2 K + 4), the features p_i of `head_features`.
-        rows: (U, n, 2 K + 4), the features S_i.
-        position_scale: factor on the positions in `point`.
-        chance: a probability, `HeadTraining.disturb`.
-    """
-    point, rows = point.clone(), rows.clone()
-    classes = (point.shape[1] - POINT_VALUES) // 2
-    position = slice(2 * classes, 2 * classes + 3)
-
-    for part in torch.arange(len(point)).tensor_split(DISTURBED_PARTS):
-        for network in (slice(0, classes), slice(classes, 2 * classes)):
-            if rng.random() >= chance or not len(part):
-                continue
-
-            # A point and its neighbours: (part, 1 + n, K) and (part, 1 + n, 3).
-            scores = torch.cat([point[part, None, network], rows[part, :, network]], dim=1)
-            at = point[part, None, position] / (position_scale or 1)
-            xyz = torch.cat([at, rows[part, :, position] + at], dim=1)
-            disturbed = disturb(scores.flatten(0, 1), xyz.flatten(0, 1), rng).view_as(scores)
-            point[part, network] = disturbed[:, 0]
-            rows[part, :, network] = disturbed[:, 1:]
-    return point, rows
 
 
 def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
