@@ -26,7 +26,7 @@ PANEL = (1000, 560)  # the width and height of a panel, pixels
 GAP = 8  # the distance between panels, pixels
 OVERSAMPLE = 2  # the resolution of the drawing, relative to the picture
 LEGEND = 56  # the height of a row of the legend, pixels
-MOST_COLUMNS = 10  # the most classes in a row of the legend
+MAX_COLUMNS = 10  # largest number of classes in a row of the legend
 LEAST = 120  # the least number of points of a class in the legend, over both upper panels
 
 BACKGROUND = np.array([13, 16, 22], np.float32)
@@ -228,7 +228,7 @@ def draw_legend(pen: ImageDraw.ImageDraw, taxonomy: Any, present: np.ndarray, to
 
 def legend_rows(present: np.ndarray) -> int:
     """Return the number of rows of the legend, in which the names do not overlap."""
-    return -(-int(np.count_nonzero(present)) // MOST_COLUMNS)
+    return -(-int(np.count_nonzero(present)) // MAX_COLUMNS)
 
 
 def reduced(sheet: Image.Image, taxonomy: Any) -> Image.Image:

@@ -3,7 +3,7 @@
 import { counted } from "./errors.js";
 import { quantilesOf } from "./sensor/statistics.js";
 
-const MOST_POINTS = 400_000;  // the most points that the viewer shows; of larger scans, every second or third point
+const MAX_POINTS = 400_000;  // largest number of points that the viewer shows; of larger scans, every second or third point
 const REACH = 500;  // the largest coordinate that the viewer shows, metres
 const LEVELS = 32_767;  // the largest int16
 const TITLES = { rv: "RV", bev: "BEV", ensemble: "Ensemble", amvnet: "AMVNet" };
@@ -16,7 +16,7 @@ const TITLES = { rv: "RV", bev: "BEV", ensemble: "Ensemble", amvnet: "AMVNet" };
 export function shownScan(name, { points, count }, segmentation, description) {
   const isNear = (i) => [0, 1, 2].every((axis) => Math.abs(points[4 * i + axis]) <= REACH);
   const near = Uint32Array.from({ length: points.length / 4 }, (_, i) => i).filter(isNear);
-  const stride = Math.max(1, Math.ceil(near.length / MOST_POINTS)), indices = near.filter((_, place) => place % stride === 0);
+  const stride = Math.max(1, Math.ceil(near.length / MAX_POINTS)), indices = near.filter((_, place) => place % stride === 0);
 
   const scan = { name, index: 0, count: indices.length, note: noteOf(count - near.length, stride), ...quantised(points, indices) };
   const byte = (value) => Math.round(Math.min(Math.max(value, 0), 1) * 255);

@@ -12,7 +12,7 @@ import { normalise } from "./sensor/normalise.js";
 import { shownScan } from "./shown.js";
 
 const LARGEST_FILE = 200;  // the largest file that is read, megabytes
-const MOST_THREADS = 8;
+const MAX_THREADS = 8;
 let runtime = null, loaded = { folder: null, networks: null }, last = Promise.resolve();
 
 addEventListener("message", ({ data }) => {
@@ -71,7 +71,7 @@ async function start(wanted) {
   const isPossible = wanted === "webgpu" && "Suspending" in WebAssembly;
   const adapter = isPossible ? await navigator.gpu?.requestAdapter() : null, device = adapter ? "webgpu" : "wasm";
   const ort = await import(`./ort/ort.${adapter ? "jspi" : "wasm"}.min.mjs`);
-  const threads = crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, MOST_THREADS) : 1;
+  const threads = crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, MAX_THREADS) : 1;
   ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
   ort.env.wasm.numThreads = threads;
   const many = threads > 1 ? `${threads} threads` : "one thread";

@@ -19,8 +19,8 @@ from yaml.reader import ReaderError
 from amvnet.errors import InputError, shown
 
 LARGEST_YAML = 50_000  # largest size of a YAML file, bytes; PyYAML takes a second for it
-DEEPEST_YAML = 50  # most levels of nested values in a YAML file
-LONGEST_INTEGER = 40  # most digits of a whole number in a YAML file
+DEEPEST_YAML = 50  # largest number of levels of nested values in a YAML file
+LONGEST_INTEGER = 40  # largest number of digits of a whole number in a YAML file
 INTEGER = "tag:yaml.org,2002:int"  # PyYAML's tag of whole numbers
 # A pattern that matches the names of files that `atomic_write` has not finished.
 UNFINISHED_FILES = f".{'[0-9a-f]' * 32}.part*"

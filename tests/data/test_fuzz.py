@@ -24,7 +24,7 @@ METADATA = "drive/metadata.yaml"
 FORMATS = [*WRITERS, METADATA]
 HEADER = 400  # bytes: most headers are within them
 LONGEST = timedelta(seconds=10)
-MOST_MEMORY = 2 << 30  # bytes
+MAX_MEMORY = 2 << 30  # bytes
 STATUS = Path("/proc/self/status")  # of Linux
 TELLING_BYTES = [
     b"\x00",
@@ -129,7 +129,7 @@ def test_a_broken_file_gives_a_scan_or_an_error_of_one_line(
     assert error_of(scan_path) == ""
     forget_peak()
     check_broken_file()
-    assert peak_memory() < MOST_MEMORY
+    assert peak_memory() < MAX_MEMORY
 
 
 def error_of(path: Path) -> str:

@@ -18,7 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from amvnet.engines import torch as torch_engine
-from amvnet.engines.graphs import MOST_SHAPES, WARM_UP_RUNS, Captured, GraphCheck
+from amvnet.engines.graphs import MAX_SHAPES, WARM_UP_RUNS, Captured, GraphCheck
 from amvnet.engines.precision import InPrecision
 from amvnet.engines.torch import TorchEngine
 from amvnet.models import upsampled_conv
@@ -252,10 +252,10 @@ def test_gradients_and_further_shapes_are_not_captured(cuda: list[Recording]) ->
     assert not cuda
 
     with torch.inference_mode():
-        for rows in range(1, MOST_SHAPES + 4):
+        for rows in range(1, MAX_SHAPES + 4):
             x = torch.randn(rows, 3)
             assert torch.equal(network(x), net(x))
-    assert len(cuda) == MOST_SHAPES
+    assert len(cuda) == MAX_SHAPES
 
 
 def test_another_precision_of_products_is_captured_apart(cuda: list[Recording]) -> None:

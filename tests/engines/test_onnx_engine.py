@@ -130,7 +130,7 @@ def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pytest.importorskip("embreex")
-    monkeypatch.setattr(int8, "MOST_SCANS", 3)
+    monkeypatch.setattr(int8, "MAX_SCANS", 3)
     weights = load("sim-hdl64e")
     scan = int8.calibration_scans("simulated", weights)[0]
 

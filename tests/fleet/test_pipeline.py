@@ -399,7 +399,7 @@ def test_a_scan_that_ends_its_workers_is_a_broken_one(
 def test_workers_that_end_again_and_again_are_one_line(
     mortal: None, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "MOST_LOST", 0)
+    monkeypatch.setattr(pipeline, "MAX_LOST_BLOCKS", 0)
     fails(lambda: label(run_in(fleet, tmp_path), scans_of("a", "poison", "1")), "expected workers")
 
 

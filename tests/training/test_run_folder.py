@@ -8,7 +8,7 @@ import yaml
 
 from amvnet.training.run_folder import (
     LAST,
-    MOST_CHANGES,
+    MAX_CHANGES,
     SETTINGS,
     check_begun,
     describe_changes,
@@ -52,5 +52,5 @@ def test_a_refused_resume_says_which_values_differ(tmp_path: Path) -> None:
         (tmp_path / SETTINGS).write_text(text)
         fails(lambda: check_begun(tmp_path, EARLIER, True), "model.range_net.widths")
     (tmp_path / SETTINGS).unlink()
-    many = {**EARLIER, "model": {str(index): index for index in range(2 * MOST_CHANGES)}}
+    many = {**EARLIER, "model": {str(index): index for index in range(2 * MAX_CHANGES)}}
     fails(lambda: check_begun(tmp_path, many, True), "and ", " more")

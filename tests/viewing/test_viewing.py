@@ -211,7 +211,7 @@ def test_positions_are_within_half_a_step(tmp_path: Path, extent: float) -> None
 
 
 def test_a_huge_scan_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pages, "MOST_POINTS", 100)
+    monkeypatch.setattr(pages, "MAX_POINTS", 100)
     points = np.random.default_rng(0).normal(size=(250, 4))
     ids = np.arange(250) % 20
     page = write_and_read(tmp_path / "p.html", make_scan(points, labels=ids))

@@ -1,6 +1,6 @@
 // Find nearest neighbours with a k-d tree. The well-kept libraries of npm search in two dimensions, or find only one.
 
-const LEAF = 12;  // the most points of a leaf, which are compared one by one
+const LEAF = 12;  // largest number of points of a leaf, which are compared one by one
 
 export class KdTree {
   /** Sort points (4 n) into a tree. */

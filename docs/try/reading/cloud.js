@@ -7,9 +7,9 @@
 
 import { counted, InputError, shown } from "../errors.js";
 
-// The most points of a scan. A page has less memory than a program: `amvnet predict` reads ten million points.
-export const MOST_POINTS = 1_000_000;
-const MOST_RINGS = 256;  // the most lasers; a column with larger values does not hold ring indices
+// The largest number of points of a scan. A page has less memory than a program: `amvnet predict` reads ten million points.
+export const MAX_POINTS = 1_000_000;
+const MAX_RINGS = 256;  // largest number of lasers; a column with larger values does not hold ring indices
 
 // The possible names of each column; the first name that a file has is read.
 const NAMES = {
@@ -22,8 +22,8 @@ const NAMES = {
 
 /** Check the number of points that a header claims; a file of `size` bytes must have at least `least`. */
 export function checkPointCount(count, name, size = 0, least = 0) {
-  if (!(count >= 0 && count <= MOST_POINTS)) {
-    const most = counted(MOST_POINTS);
+  if (!(count >= 0 && count <= MAX_POINTS)) {
+    const most = counted(MAX_POINTS);
     throw new InputError(`${name}: expected a scan of at most ${most} points, found ${count}; split it into scans`);
   }
   if (least > size) {
@@ -66,11 +66,11 @@ export function ringIndices(values) {
   let low = Infinity, high = -Infinity;
   for (let i = 0; i < values.length; i++) {
     const value = Number.isFinite(values[i]) ? values[i] : 0;
-    if (value !== ring[i]) return null;  // a byte holds only whole numbers below MOST_RINGS
+    if (value !== ring[i]) return null;  // a byte holds only whole numbers below MAX_RINGS
     low = Math.min(low, value);
     high = Math.max(high, value);
   }
-  return low < high && high < MOST_RINGS ? ring : null;
+  return low < high && high < MAX_RINGS ? ring : null;
 }
 
 /** Return whether the point at xyz[start] has finite coordinates other than 0, 0, 0, which lost returns have. */

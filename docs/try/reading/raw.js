@@ -16,7 +16,7 @@ const NO_INTENSITY = -1;  // the intensity that some tools write for a lost retu
 const USUAL_SHARE = 0.999;  // the least share of points within these limits; the others are outliers
 
 // These limits tell ring indices from labels: lasers have similar numbers of points, or each has one elevation.
-const LARGEST_RING = 2.5;  // the most points of a ring, relative to the mean ring
+const LARGEST_RING = 2.5;  // largest number of points of a ring, relative to the mean ring
 const FEWEST_LASERS = 8;  // the fewest lasers; fewer classes may also have similar numbers of points
 const ELEVATION_SPREAD = 0.1;  // the largest variance of the elevations within a ring, relative to the scan's variance
 

@@ -16,7 +16,7 @@ const LEAST_AGREEMENT = 0.25;  // the least weighted share of the cells that lie
 // These limits tell which side of the plane is up: things stand on the ground, and there is little below it.
 const OFF_PLANE = 0.3;  // the largest distance from the plane to its points, at the sensor, metres
 const CURVED = 0.02;  // how much this distance grows for each metre from the sensor, metres
-const MOST_BELOW = 0.1;  // the largest share of points below the plane, unless more are above it
+const MAX_BELOW = 0.1;  // the largest share of points below the plane, unless more are above it
 const LOWEST = -0.5, HIGHEST = 10.0;  // the limits of the origin's height, metres; a plane above it must be sure
 
 // These limits tell whether a plane is sure enough to level a scan by it.
@@ -53,7 +53,7 @@ export function findGround(xyz) {
 
   // A plane above the origin may be a ceiling, or the lower ends of far walls.
   const [a, b, c] = plane, height = -c;
-  const isCommon = height < HIGHEST && below <= Math.max(above, MOST_BELOW);
+  const isCommon = height < HIGHEST && below <= Math.max(above, MAX_BELOW);
   const isBelow = height > LOWEST ? isCommon : isSure && below < above / 2;
   if (agreement <= LEAST_AGREEMENT || !isBelow) return null;
   const length = Math.hypot(a, b, 1);

@@ -22,7 +22,7 @@ from amvnet.errors import without_secrets
 from amvnet.progress import Progress, Tenths
 
 LONGEST_LINE = 5000  # longest line that is printed in full, characters
-MOST_LINES = 2000  # most lines that are printed of one text
+MAX_LINES = 2000  # largest number of lines that are printed of one text
 
 
 class SafeStream:
@@ -77,12 +77,12 @@ def report(line: str) -> None:
 
 
 def report_lines(text: str) -> None:
-    """Print a text of several lines, but at most `MOST_LINES` of them."""
+    """Print a text of several lines, but at most `MAX_LINES` of them."""
     lines = text.split("\n")
-    for line in lines[:MOST_LINES]:
+    for line in lines[:MAX_LINES]:
         report(line)
-    if len(lines) > MOST_LINES:
-        report(f"... ({len(lines) - MOST_LINES} more lines)")
+    if len(lines) > MAX_LINES:
+        report(f"... ({len(lines) - MAX_LINES} more lines)")
 
 
 def show(table: RenderableType) -> None:

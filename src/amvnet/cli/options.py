@@ -31,7 +31,7 @@ Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
 FormatName = Literal["label", "npy", "ply"]  # the format of label files for scan files
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
-MOST_SEQUENCES = 20  # most sequences that a line names
+MAX_SEQUENCES = 20  # largest number of sequences that a line names
 
 
 @dataclass(frozen=True)
@@ -302,8 +302,8 @@ def describe_records(records: Sequence[ScanRecord]) -> str:
     if not records:
         return "none"
     names = sorted({record.sequence for record in records})
-    text = ", ".join(names[:MOST_SEQUENCES])
-    if len(names) > MOST_SEQUENCES:
-        text += f" and {len(names) - MOST_SEQUENCES} more"
+    text = ", ".join(names[:MAX_SEQUENCES])
+    if len(names) > MAX_SEQUENCES:
+        text += f" and {len(names) - MAX_SEQUENCES} more"
 
     return f"{counted(len(records), 'scan')} of {text}"

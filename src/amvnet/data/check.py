@@ -21,7 +21,7 @@ from amvnet.files import atomic_write
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 
-SHOWN_PROBLEMS = 5  # the most unknown ids that a message lists
+SHOWN_PROBLEMS = 5  # largest number of unknown ids that a message lists
 # The largest file of remembered contents that is read, bytes. 20,000 scans need 5 million bytes.
 LARGEST_MEMORY = 200_000_000
 

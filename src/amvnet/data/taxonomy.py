@@ -21,13 +21,13 @@ from amvnet.errors import InputError, one_line_errors, shown
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
-MOST_CLASSES = 255  # the most classes: train ids are uint8
+MAX_CLASSES = 255  # largest number of classes: train ids are uint8
 # A user's class without a colour gets a hue that is far from all earlier hues. SATURATION and VALUE
 # are in [0, 1]; GOLDEN_ANGLE is the step from one hue to the next, as a share of the hue circle.
 SATURATION = 0.65
 VALUE = 0.95
 GOLDEN_ANGLE = 0.381966
-SHOWN = 5  # the most unknown ids or names that an error message lists
+SHOWN = 5  # largest number of unknown ids or names that an error message lists
 UNKNOWN = -1  # the mark of raw ids without a train id in lookup tables
 
 Color = tuple[int, int, int]  # RGB in 0..255
@@ -70,7 +70,7 @@ class Taxonomy:
             check_text(f"taxonomy {self.name}: classes", name)
         for sequence in chain.from_iterable(self.splits.values()):
             check_text(f"taxonomy {self.name}: splits", sequence)
-        self._check(1 <= self.size <= MOST_CLASSES, f"1 to {MOST_CLASSES} classes", self.size)
+        self._check(1 <= self.size <= MAX_CLASSES, f"1 to {MAX_CLASSES} classes", self.size)
 
         channels = list(chain.from_iterable(self.colors))
         raw_ids = [raw for raw in self.raw_to_train if not isinstance(raw, str)]

@@ -94,7 +94,7 @@ class Engine:
 
 
 class WithUnet(nn.Module):
-    """PolarNet whose U-Net, which has most of the work, is run by something else than torch."""
+    """PolarNet whose U-Net, which has most of the work, is run by something other than torch."""
 
     def __init__(self, net: PolarNet, unet: Network) -> None:
         super().__init__()

@@ -18,7 +18,7 @@ from amvnet.models.amvnet import Scores
 from amvnet.models.views.points import PointBatch
 
 WARM_UP_RUNS = 2  # runs before the capture, in which libraries choose their algorithms
-MOST_SHAPES = 8  # the most shapes that are captured for a network; each takes memory
+MAX_SHAPES = 8  # largest number of shapes that are captured for a network; each takes memory
 # The largest change of a point's probabilities by graphs, as a share of its largest probability.
 # The rounding of bfloat16 changes hardly any point by half as much (docs/log.md).
 LARGEST_CHANGE = 0.1
@@ -26,7 +26,7 @@ LARGEST_SHARE = 0.001  # the largest share of points that may change more
 
 
 class GraphCheck:
-    """Turns the graphs of a model off if one cannot be captured or gives other scores.
+    """A check that turns off the CUDA graphs of a model if one fails or gives other scores.
 
     Attributes:
         is_passed: False once a graph has failed.
@@ -35,18 +35,18 @@ class GraphCheck:
     def __init__(self) -> None:
         self.is_passed = True
         self._is_paused = False
-        self._checked: set[int] = set()  # numbers of scans in a batch
+        self._checked: set[int] = set()  # numbers of scans for which a batch has been checked
         self._lock = Lock()
 
     @property
     def are_graphs_on(self) -> bool:
-        """Whether networks are to be replayed."""
+        """Whether networks replay their graphs."""
         return self.is_passed and not self._is_paused
 
     def score(self, score: Callable[[PointBatch], Scores], batch: PointBatch) -> Scores:
         """Score a batch; check the graphs on the first batch of each number of scans.
 
-        The check compares the scores by graphs with scores without graphs, and returns the latter.
+        The check compares the scores with and without graphs; it returns the scores without graphs.
 
         Args:
             score: scores a batch by a model whose networks are `Captured`.
@@ -61,7 +61,7 @@ class GraphCheck:
             with self._paused():
                 expected = score(batch)
             if self.is_passed and not _agree(replayed, expected):
-                self.fail("their scores differ from those without graphs")
+                self.fail("their scores differ from the scores without graphs")
             self._checked.add(batch.count)
         return expected
 
@@ -105,8 +105,9 @@ class Captured(nn.Module):
     """A network that is captured once for each shape of its input, and replayed from then on.
 
     The network maps one tensor on a GPU to another. All its shapes must follow from the shape of
-    the input, and it must not wait for the GPU. Its kernels are launched one by one if the check
-    has turned graphs off, if gradients are computed, and for shapes after the first `MOST_SHAPES`.
+    the input, and it must not wait for the GPU. Its kernels are launched one by one if
+    `check` has turned graphs off, if gradients are computed, and for shapes after the first
+    `MAX_SHAPES`.
     Several threads may call it.
     """
 
@@ -114,7 +115,8 @@ class Captured(nn.Module):
         super().__init__()
         self.net = net
         self.check = check
-        self._graphs: dict[Any, Graph] = {}  # by what the kernels depend on
+        # Graphs by the properties of an input that the kernels depend on.
+        self._graphs: dict[Any, Graph] = {}
         self._pool: Any = None  # the pool of memory that all graphs of the network share
         self._lock = Lock()
 
@@ -137,7 +139,7 @@ class Captured(nn.Module):
         key = (x.shape, x.stride(), x.dtype, torch.is_inference_mode_enabled(), precision)
         if key in self._graphs:
             return self._graphs[key]
-        if len(self._graphs) == MOST_SHAPES:
+        if len(self._graphs) == MAX_SHAPES:
             return None
 
         try:
@@ -147,7 +149,7 @@ class Captured(nn.Module):
         return self._graphs.get(key)
 
     def _capture(self, x: Tensor) -> Graph:
-        # The capture computes on zeros, so that the check sees whether a replay takes its input.
+        # Capture on zeros: the check then notices a replay that does not read its input.
         static = torch.zeros_like(x)  # keeps the strides
 
         # CUDA requires that the runs before the capture use another stream than the current one.

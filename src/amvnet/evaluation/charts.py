@@ -19,7 +19,7 @@ from amvnet.outputs import Signature
 
 SIZE = (6.0, 3.6)  # width and height of a figure, inches
 DOTS_PER_INCH = 160
-MOST_MARKED = 20  # longest sweep that is drawn with markers; in longer ones, they would overlap
+MAX_MARKED = 20  # only sweeps of at most as many values have markers, which overlap in longer ones
 Cell = str | float | int | None  # a cell of a table, or None for an empty cell
 
 
@@ -75,7 +75,7 @@ def write_sweep(
     values, shares, mious, _ = zip(*rows, strict=True)
 
     figure, axes = _figure(f"{name} on {dataset}")
-    marker = "" if len(rows) > MOST_MARKED else "o"
+    marker = "" if len(rows) > MAX_MARKED else "o"
     miou_line = axes.plot(values, mious, color="black", marker=marker, label="mIoU")
     axes.set(xlabel=name, ylabel="mIoU (%)")
     axes.axvline(used, color="0.6", linewidth=0.8, linestyle=":")

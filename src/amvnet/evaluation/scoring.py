@@ -36,7 +36,7 @@ Result = TypeVar("Result")
 # networks.
 MethodLabels = tuple[dict[str, np.ndarray], np.ndarray | None]
 
-MOST_PICTURES = 4  # most scans that are drawn; they are evenly spaced
+MAX_PICTURES = 4  # largest number of scans that are drawn; they are evenly spaced
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def pictures_of(records: Sequence[ScanRecord], folder: Path) -> dict[Path, Signa
 
 def _pictured(records: Sequence[ScanRecord]) -> Sequence[ScanRecord]:
     """Return the scans that are drawn."""
-    return evenly_spaced(records, MOST_PICTURES)
+    return evenly_spaced(records, MAX_PICTURES)
 
 
 def _picture_of(record: ScanRecord, folder: Path) -> Path:

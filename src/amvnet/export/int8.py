@@ -24,7 +24,7 @@ from amvnet.weights.file import Weights
 
 SIMULATED = "simulated"  # stands for simulated streets, as the weights' sensor sees them
 SEED = 20_261_121  # the seed of these streets, far from the seeds of any training
-MOST_SCANS = 20  # the most scans that are used, evenly spaced
+MAX_SCANS = 20  # largest number of scans that are used, evenly spaced
 CHECK_EVERY = 5  # the first of every five scans is for the check, the others to calibrate
 # The least share of labels that must stay; a good calibration keeps far more.
 LEAST_AGREEMENT = 0.9
@@ -35,7 +35,7 @@ KEEPS_FIRST_LAYER = {"range_net": True, "polar_map": False}
 
 
 def calibration_scans(text: str, weights: Weights) -> list[Scan]:
-    """Read up to `MOST_SCANS` scans for the calibration, or simulate streets.
+    """Read up to `MAX_SCANS` scans for the calibration, or simulate streets.
 
     Args:
         text: a dataset, a scan file, a folder of scan files, or `SIMULATED`.
@@ -56,7 +56,7 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
             f"found {sensor!r}; give scans of this sensor to amvnet export --int8"
         )
     with temporary_folder() as folder:
-        simulate(folder, sensor=sensor, sequences=MOST_SCANS, scans=1, seed=SEED)
+        simulate(folder, sensor=sensor, sequences=MAX_SCANS, scans=1, seed=SEED)
         return _read(str(folder), weights)
 
 
@@ -125,12 +125,12 @@ class _Recorder(OnnxSegmenter):
 
 
 def _read(text: str, weights: Weights) -> list[Scan]:
-    """Read up to `MOST_SCANS` scans, evenly spaced, normalised as `predict` normalises them."""
+    """Read up to `MAX_SCANS` scans, evenly spaced, normalised as `predict` normalises them."""
     normaliser = normaliser_for(weights)
     inputs, _ = list_inputs([text], taxonomy=weights.taxonomy, normaliser=normaliser)
     intensity = trained_intensity(weights.training, weights.sensor)
     scans = []
-    for scan_input in evenly_spaced(inputs, MOST_SCANS):
+    for scan_input in evenly_spaced(inputs, MAX_SCANS):
         scan = scan_input.load().scan
         if scan.valid.any():
             scans.append(match_scan(scan, intensity))

@@ -40,8 +40,8 @@ from amvnet.models.methods import Compute
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
 
-TRANSFERS = 8  # the number of files that are fetched from object storage at the same time
-# The column that says whether an error concerns all scans, because none can be written.
+TRANSFERS = 8  # number of files that are fetched from object storage at the same time
+# The column that says whether an error stops the run, because no labels can be written.
 IS_FATAL = pa.field("is_fatal", pa.bool_())
 DEFAULTS = Compute()
 
@@ -49,7 +49,7 @@ Row = dict[str, Any]
 
 
 class LabelScans:
-    """Labels scan files, as a class for `map_batches` of Ray Data with `batch_format="pyarrow"`.
+    """A labeller of scan files, for `map_batches` of Ray Data with `batch_format="pyarrow"`.
 
     A batch is a table with a row for each scan and the columns `path`, `name`, `drive` and
     `estimates`; only `path` is needed. The column `estimates` holds what `MeasureSensors` has
@@ -181,7 +181,7 @@ class LabelScans:
 
 
 class MeasureSensors:
-    """Measures the sensors of drives on their first scans, as a class for `map_batches`.
+    """A class for `map_batches` that measures the sensors of drives on their first scans.
 
     Args:
         request: how the scans are labelled.

@@ -26,7 +26,7 @@ MANIFESTS = (".parquet", ".csv")
 COLUMNS = ("path", "name", "drive")  # the columns of a manifest; only `path` is needed
 SCANS_SCHEMA = pa.schema([(name, pa.string()) for name in COLUMNS])
 CSV_BYTES = 16 << 20  # the bytes of a CSV file that are read at a time
-TABLE_SCANS = 65_536  # the most scans of a folder in one table
+TABLE_SCANS = 65_536  # largest number of scans of a folder in one table
 
 
 class NameSet:

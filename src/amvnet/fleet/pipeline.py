@@ -35,22 +35,23 @@ from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.sensors.measure import MEASURED_SCANS
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
-os.environ.setdefault("RAY_worker_niceness", "0")  # the niceness of `predict`, in place of 15
+# Workers get the niceness of `predict`; Ray's default is 15.
+os.environ.setdefault("RAY_worker_niceness", "0")
 import ray
 import ray.data
 from ray.exceptions import RayError
 
-WINDOW = 256_000  # the number of scans that are planned together
-BLOCK = 64  # the number of scans that a worker takes at a time
-REPORTED_DRIVES = 10  # the most drives whose assumptions are printed
+WINDOW = 256_000  # number of scans that are planned together
+BLOCK = 64  # number of scans that a worker takes at a time
+REPORTED_DRIVES = 10  # largest number of drives whose assumptions are printed
 
 # The shared memory of a Ray that starts on this machine, bytes.
 OBJECT_STORE = 500_000_000
-WORKER_CORES = 4  # the most cores of a worker without a GPU
-# The most blocks that a worker has at a time, so that it need not wait for the next block.
+WORKER_CORES = 4  # largest number of cores of a worker without a GPU
+# Largest number of blocks that a worker has at a time; with two, it need not wait for the next one.
 WORKER_BLOCKS = 2
-RETRIES = 2  # how often a block is tried again whose worker has ended
-MOST_LOST = 100  # the most blocks of a window that may be lost because they end their workers
+RETRIES = 2  # number of times that a block is tried again after its worker has ended
+MAX_LOST_BLOCKS = 100  # largest number of blocks in a window that may end their workers
 ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-\[\]]+:\d+")
 
 
@@ -98,10 +99,12 @@ def label_fleet(
         The number of label files of these scans that exist, counted in the output folder.
 
     Raises:
-        InputError: before anything is computed, if an input or the output folder cannot be used, or
-            the earlier run had another request; while scans are listed, if two have the same name;
-            at any time, if the workers cannot run; at the end, if all scans are broken.
-        SomeBroken: at the end, if some scans are broken.
+        InputError: if an input or the output folder cannot be used.
+        InputError: if the earlier run had another request.
+        InputError: if two scans have the same name; earlier windows are then labelled.
+        InputError: if the workers cannot run.
+        InputError: if all scans are broken.
+        SomeBroken: if some scans are broken; all others are then labelled.
         OSError: if labels cannot be written.
     """
     place = Place.of(out)
@@ -162,10 +165,10 @@ class FleetRun:
         self.resources = resources
         self._progress = progress
         self._report = report
-        self._paths = NameSet()  # the files that are written
-        self._names = NameSet()  # the scans
-        self._planned = 0
-        self._taken = 0
+        self._paths = NameSet()  # names of the files that are written
+        self._names = NameSet()  # names of the scans
+        self._planned = 0  # number of scans to label in all windows so far
+        self._done = 0
 
     def plan(self, window: pa.Table) -> pa.Table:
         """Return the scans that are not done; raise InputError if two would write the same file."""
@@ -193,18 +196,19 @@ class FleetRun:
         if not first:
             return
 
-        each = max(BLOCK // MEASURED_SCANS, 1)
+        size = max(BLOCK // MEASURED_SCANS, 1)  # number of drives in a block
         drives = list(first.values())
-        groups = [drives[start : start + each] for start in range(0, len(drives), each)]
+        groups = [drives[start : start + size] for start in range(0, len(drives), size)]
         blocks = [window.take(list(chain.from_iterable(group))) for group in groups]
         rows = {drive: describe_drive(drive, "", None) for drive in first}
         workers = self._on_workers(MeasureSensors, (self.request,), blocks, {"num_cpus": 1})
         for table in workers:
             rows |= {row["drive"]: row for row in table.to_pylist()}
         self.results.add_drives(pa.Table.from_pylist(list(rows.values()), DRIVES_SCHEMA))
-        self._say_assumed(sorted(rows.values(), key=itemgetter("drive")))
+        self._report_assumptions(sorted(rows.values(), key=itemgetter("drive")))
 
-    def _say_assumed(self, rows: Sequence[dict[str, Any]]) -> None:
+    def _report_assumptions(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Report what is assumed of the sensors of some drives, given by their rows."""
         for row in rows[:REPORTED_DRIVES]:
             self._report(row["assumed"] or f"{row['drive']}: expected scans to measure, found none")
         more = len(rows) - REPORTED_DRIVES
@@ -220,10 +224,10 @@ class FleetRun:
             OSError: if labels cannot be written.
         """
         lost = self._label_in_blocks(_with_estimates(scans, self.results.estimates), BLOCK)
-        # Some of these scans end their workers. Blocks of one scan show which ones.
+        # Some of these scans end their workers. Label them one by one to find out which.
         lost = self._label_in_blocks(lost, 1)
         if len(lost):
-            self._take(self._rows_of_lost(lost))
+            self._add_rows(self._rows_of_lost(lost))
 
     def _label_in_blocks(self, scans: pa.Table, size: int) -> pa.Table:
         """Label scans in blocks of a size; return the scans whose workers have ended."""
@@ -233,15 +237,15 @@ class FleetRun:
         cluster = self.cluster
         arguments = (self.request, self.results.out.address, cluster.compute, cluster.batch)
         done: set[str] = set()
-        most_lost = MOST_LOST if size > 1 else len(blocks)
-        tables = self._on_workers(LabelScans, arguments, blocks, self.resources, most_lost)
+        max_lost = MAX_LOST_BLOCKS if size > 1 else len(blocks)
+        tables = self._on_workers(LabelScans, arguments, blocks, self.resources, max_lost)
         with closing(tables):
             for rows in tables:
                 done.update(rows["scan"].to_pylist())
-                self._take(rows)
+                self._add_rows(rows)
         return scans.filter(pa.array([name not in done for name in scans["name"].to_pylist()]))
 
-    def _take(self, rows: pa.Table) -> None:
+    def _add_rows(self, rows: pa.Table) -> None:
         """Add rows to the results; raise OSError if a row says that labels cannot be written."""
         is_fatal = rows[IS_FATAL.name]
         self.results.add(rows.filter(pc.invert(is_fatal)).drop_columns([IS_FATAL.name]))
@@ -249,8 +253,8 @@ class FleetRun:
             place, _, reason = line.rpartition(": ")
             raise OSError(errno.EIO, reason, place)
 
-        self._taken += len(rows)
-        self._progress(self._taken, self._planned)
+        self._done += len(rows)
+        self._progress(self._done, self._planned)
 
     def _rows_of_lost(self, scans: pa.Table) -> pa.Table:
         """Return the rows of scans that end every worker that reads them."""
@@ -268,7 +272,7 @@ class FleetRun:
         arguments: tuple[Any, ...],
         blocks: Sequence[pa.Table],
         resources: dict[str, Any],
-        most_lost: int = -1,
+        max_lost: int = -1,
     ) -> Generator[pa.Table]:
         """Let workers process blocks.
 
@@ -277,18 +281,19 @@ class FleetRun:
             arguments: the arguments of the class.
             blocks: the tables.
             resources: the resources of each worker, as options of Ray.
-            most_lost: the most blocks that may be lost; -1 stands for any number.
+            max_lost: the largest number of blocks that may be lost; -1 sets no limit.
 
         Yields:
-            The table that a worker returns for each block. A block is lost if every worker that
-            takes it ends.
+            The table that a worker returns for each block, except for lost blocks. A block is lost
+            if every worker that takes it ends.
 
         Raises:
-            InputError: if the workers cannot be started, or more blocks are lost.
+            InputError: if the workers cannot be started.
+            InputError: if more than `max_lost` blocks are lost.
         """
         context = ray.data.DataContext.get_current()
         context.enable_progress_bars = False
-        context.max_errored_blocks = most_lost
+        context.max_errored_blocks = max_lost
         # If a worker ends, the blocks that wait for it are lost as well. Blocks of one scan
         # therefore never wait.
         queued = WORKER_BLOCKS if max(map(len, blocks)) > 1 else 1
@@ -365,8 +370,9 @@ def _with_estimates(scans: pa.Table, estimates: dict[str, str]) -> pa.Table:
     for index, drive in enumerate(scans["drive"].to_pylist()):
         order.setdefault(drive, []).append(index)
     scans = scans.take(pa.array(chain.from_iterable(order.values()), pa.int64()))
-    of_each = [estimates[drive] for drive in scans["drive"].to_pylist()]
-    return scans.append_column("estimates", pa.array(of_each, pa.string())).combine_chunks()
+    drive_estimates = [estimates[drive] for drive in scans["drive"].to_pylist()]
+    column = pa.array(drive_estimates, pa.string())
+    return scans.append_column("estimates", column).combine_chunks()
 
 
 # ---- Ray
@@ -379,7 +385,7 @@ def connect(address: str | None = None) -> None:
         address: the address, as in `Cluster`.
 
     Raises:
-        InputError: if the text is no address, or there is no cluster at it.
+        InputError: if the text is not an address, or no cluster has it.
     """
     if address is not None and not ADDRESS.fullmatch(address):
         raise InputError(
@@ -409,7 +415,7 @@ def connect(address: str | None = None) -> None:
 
 @contextmanager
 def _own_signals() -> Iterator[None]:
-    """Keep the handlers of signals: Ray's would abort the process without a word."""
+    """Restore the signal handlers: Ray's handlers would abort the process without a message."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
     if threading.current_thread() is threading.main_thread():
@@ -431,14 +437,14 @@ def share_cluster(cluster: Cluster) -> dict[str, Any]:
         raise InputError("--device: expected a cluster with a GPU, found none; leave it out")
     if gpus and device != "cpu":
         return {"num_gpus": 1, "num_cpus": 1}
-    of_nodes = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
+    node_cores = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
     # Some clusters start without any node for workers.
-    smallest = min(filter(None, of_nodes), default=WORKER_CORES)
+    smallest = min(filter(None, node_cores), default=WORKER_CORES)
     return {"num_cpus": max(min(WORKER_CORES, smallest, cores // (cluster.workers or 1)), 1)}
 
 
 def _precision(request: LabellingRequest, cluster: Cluster, resources: dict[str, Any]) -> Any:
-    """Return the precision of all workers; "auto" becomes the choice of a machine with a GPU."""
+    """Return the precision of all workers; with GPUs, a worker chooses it for "auto"."""
     if request.precision != "auto" or "num_gpus" not in resources:
         return choose_precision(request.precision, "cpu")
     device = cluster.compute.device

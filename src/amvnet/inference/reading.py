@@ -19,8 +19,9 @@ from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
 
-# The most columns of an array of points; an array with more is taken for a transposed one.
-MOST_COLUMNS = 64
+# Largest number of columns of an array of points; an array with more columns is taken for a
+# transposed one.
+MAX_COLUMNS = 64
 EXPECTED = "points of shape (N, 3 or more) with columns x, y, z, intensity"
 
 
@@ -89,7 +90,7 @@ def array_scan(
 
 def _check_shape(array: np.ndarray) -> None:
     """Raise InputError unless an array without named fields has a row for each point."""
-    is_transposed = array.ndim == 2 and len(array) < MOST_COLUMNS < array.shape[1]
+    is_transposed = array.ndim == 2 and len(array) < MAX_COLUMNS < array.shape[1]
     if array.ndim == 2 and array.shape[1] >= 3 and not is_transposed:
         return
 

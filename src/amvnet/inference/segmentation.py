@@ -17,7 +17,7 @@ from amvnet.models.amvnet import Scores
 from amvnet.outputs import check_outputs
 from amvnet.scan import Scan
 
-SHOWN_CLASSES = 3  # the most classes that the short description of a result names
+SHOWN_CLASSES = 3  # largest number of classes that the short description of a result names
 
 # The ratio of the odds of an uncertain point to the usual odds, above which labels are doubtful.
 # A ratio of odds suits every tau, a difference of shares does not. With weights from simulated

@@ -17,7 +17,7 @@ ELEVATION_BINS = 64  # number of bins that replace the lasers of a scan without 
 OUTLIERS = 0.5  # share of the points below the lowest bin, and above the highest bin, percent
 
 LARGEST_LASER_DROP = 0.5  # largest share of the lasers that is dropped at random
-MOST_BLOCKS = 4  # most blocks that are dropped from a scan
+MAX_BLOCKS = 4  # largest number of blocks that are dropped from a scan
 BLOCK_WIDTH = (5.0, 40.0)  # least and greatest width of a block, degrees of azimuth
 BLOCK_HEIGHT = (3.0, 12.0)  # least and greatest height of a block, degrees of elevation
 BANDS = (3, 6)  # fewest and most bands of elevation in mixed scans, as in LaserMix
@@ -218,12 +218,12 @@ def _drop_lasers(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def _drop_blocks(scan: Scan, rng: np.random.Generator) -> Scan:
-    """Drop up to `MOST_BLOCKS` rectangles of azimuth and elevation."""
+    """Drop up to `MAX_BLOCKS` rectangles of azimuth and elevation."""
     elevation = np.degrees(_elevations(scan))
     lowest, highest = _spread(elevation)
 
     is_hidden = np.zeros(len(scan), dtype=bool)
-    for _ in range(rng.integers(1, MOST_BLOCKS + 1)):
+    for _ in range(rng.integers(1, MAX_BLOCKS + 1)):
         start = rng.uniform(-np.pi, np.pi)
         width = np.radians(rng.uniform(*BLOCK_WIDTH))
         height = rng.uniform(*BLOCK_HEIGHT)

@@ -16,7 +16,7 @@ from amvnet.progress import Tenths, counted
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import COUNTS
 
-SHOWN_SCANS = 3  # most broken scans that a message names
+SHOWN_SCANS = 3  # largest number of broken scans that a message names
 
 
 def check_data(plan: Plan) -> np.ndarray:

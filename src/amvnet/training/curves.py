@@ -12,7 +12,7 @@ from amvnet.files import atomic_write
 
 ROW_SIZE = (12.0, 3.6)  # width and height of the row of a stage, inches
 DOTS_PER_INCH = 120
-MOST_MARKED = 30  # curves with fewer points than this have markers
+MAX_MARKED = 30  # only curves with fewer points have markers
 
 # Names of the metrics in TensorBoard's files.
 LOSS = "train/loss"
@@ -80,7 +80,7 @@ def draw_curves(stages: Mapping[str, Curves], path: Path) -> Path:
     rows = figure.subplots(len(stages), 3, squeeze=False)
     for (name, curves), (loss, miou, iou) in zip(stages.items(), rows, strict=True):
         if curves.loss:
-            marker = "." if len(curves.loss) < MOST_MARKED else ""
+            marker = "." if len(curves.loss) < MAX_MARKED else ""
             loss.plot(*zip(*curves.loss, strict=True), color="black", linewidth=1, marker=marker)
         loss.set_xlim(left=0)
         _label(loss, f"{name}: loss", "epoch")

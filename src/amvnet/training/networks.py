@@ -267,24 +267,27 @@ def make_stage(
 def make_loaders(
     plan: Plan, config: NetworkTraining, intensity: TrainedIntensity | None
 ) -> Loaders:
-    """Return the loaders of the batches to learn from, and to validate with."""
+    """Return the loaders of training batches and of validation batches."""
     training = plan.recipe.training
     scans = plan.scans
     shared: dict[str, Any] = {"workers": training.workers, "processes": plan.processes}
 
     # The number of scans that one process takes at a time.
     batch = config.batch // config.accumulate // plan.processes.size
-    how: dict[str, Any] = {"intensity": intensity, "lasers": plan.recipe.model.range_view.lasers}
-    train_set = ScanSet(scans.dataset, scans.train, training.augment, training.seed, **how)
+    scan_options: dict[str, Any] = {
+        "intensity": intensity,
+        "lasers": plan.recipe.model.range_view.lasers,
+    }
+    train_set = ScanSet(scans.dataset, scans.train, training.augment, training.seed, **scan_options)
     train = make_loader(train_set, batch, shuffle=True, **shared)
     if not scans.val:
         return train, None
-    val_set = ScanSet(scans.dataset, scans.val, **how)
+    val_set = ScanSet(scans.dataset, scans.val, **scan_options)
     return train, make_loader(val_set, 1, shuffle=False, **shared)
 
 
 def _intensity(plan: Plan, weights: Weights) -> TrainedIntensity | None:
-    """Return the distribution to which the intensities of each scan are matched, as `predict` does.
+    """Return the distribution to which the intensities of each scan are matched, like `predict`.
 
     If it is None, intensities stay unchanged.
     """

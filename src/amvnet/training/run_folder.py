@@ -43,7 +43,7 @@ SCANS_CHANGED = {
     "scans.train": "other scans to train on",
     "scans.val": "other scans to validate with",
 }
-MOST_CHANGES = 6  # the most changed settings that a message names
+MAX_CHANGES = 6  # largest number of changed settings that a message names
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")  # the packages whose versions are recorded
 
 
@@ -190,11 +190,11 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     begun = _entries(folder / SETTINGS)
     if begun != settings:
         changes = describe_changes(begun, settings)
-        others = len(changes) - MOST_CHANGES
+        others = len(changes) - MAX_CHANGES
         more = f" and {others} more" if others > 0 else ""
         raise InputError(
             f"{folder}: expected the settings of the earlier run ({SETTINGS}), found "
-            f"{', '.join(changes[:MOST_CHANGES])}{more}; resume it with them, or train further "
+            f"{', '.join(changes[:MAX_CHANGES])}{more}; resume it with them, or train further "
             f"from its weights in another folder: --init {folder.parent} --out FOLDER"
         )
 

@@ -23,7 +23,8 @@ from amvnet.sensors.intensity import (
 )
 from amvnet.sensors.record import AS_IS_KEY, SENSOR_KEY, measure_sensor, normalised_record
 
-SAMPLED_SCANS = 60  # most scans that are measured; enough for the mean height of simulated sensors
+# Largest number of scans that are measured; it is enough for the mean height of simulated sensors.
+SAMPLED_SCANS = 60
 
 
 def sensor_record(

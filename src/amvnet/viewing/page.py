@@ -29,9 +29,9 @@ from amvnet.models.methods import METHODS, title_of
 from amvnet.outputs import Signature, check_outputs
 from amvnet.viewing.shown_scans import RIGHT, UNLABELLED, UNSCORED, ShownScan, shown_scan
 
-# The most points of a scan that the page shows. It shows every second or third point of a larger
-# scan, so that phones keep up.
-MOST_POINTS = 400_000
+# Largest number of points of a scan that the page shows. The page shows every second or third point
+# of a larger scan, so that phones keep up.
+MAX_POINTS = 400_000
 # The largest coordinate that the page shows, metres. Farther points are left out, so that rounding
 # to int16 moves a point by 0.8 cm at most.
 REACH = 500.0
@@ -90,7 +90,7 @@ def show(result: Segmentation, path: Path | str | None = None, open_browser: boo
         open_browser: also open the page.
 
     Raises:
-        InputError: if the file cannot be written, or holds something else than a page.
+        InputError: if the file cannot be written, or holds something other than a page.
     """
     origin = result.require_origin()
     if path is not None:
@@ -152,7 +152,7 @@ def pack(shown: ShownScan) -> Packed:
     in_reach = shown.valid & (np.abs(shown.points[:, :3]) <= REACH).all(axis=1)
     indices = np.flatnonzero(in_reach)
     left_out = len(shown.points) - len(indices)
-    stride = max(1, math.ceil(len(indices) / MOST_POINTS))
+    stride = max(1, math.ceil(len(indices) / MAX_POINTS))
     indices = indices[::stride]
 
     xyz = shown.points[indices, :3].astype(np.float64)

@@ -21,8 +21,8 @@ TITLES = {
 }
 # The columns of the table of metrics: their titles, by the key of the validation metric.
 METRICS = {"val/miou": "mIoU", "val/miou_present": "mIoU, classes present", "val/acc": "accuracy"}
-MOST_SETTINGS = 100  # the most settings that the card lists of a part's training
-LONGEST_CELL = 300  # the most characters in a cell of a table
+MAX_SETTINGS = 100  # largest number of settings that the card lists of a part's training
+LONGEST_CELL = 300  # largest number of characters in a cell of a table
 BUILT_IN_LICENCE = "apache-2.0"  # the licence of the built-in weights
 NO_LICENCE = (
     "The file names no licence. Weights may be bound by the terms of the data that they were "
@@ -53,7 +53,7 @@ def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
     ]
     for part in weights.parts:
         lines = [f"## Training: {part}\n", "| Setting | Value |", "|---|---|"]
-        for key, value in islice(flat(weights.training.get(part, {}), depth=3), MOST_SETTINGS):
+        for key, value in islice(flat(weights.training.get(part, {}), depth=3), MAX_SETTINGS):
             text = value if isinstance(value, str) else abridged.repr(value)
             lines.append(f"| {_cell(key)} | {_cell(text)} |")
         sections.append("\n".join(lines))

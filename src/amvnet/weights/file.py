@@ -38,7 +38,7 @@ USUAL_UNCERTAIN = 0.2
 FLOATS = ("F16", "BF16", "F32", "F64")
 COUNTS = ("I64",)
 LONGEST_DESCRIPTION = 10_000_000  # limit in characters; built-in weights have 6,000
-MOST_PARAMETERS = 500_000_000  # limit for a model; the paper's model has about 60 million
+MAX_PARAMETERS = 500_000_000  # limit for a model; the paper's model has about 60 million
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
 _FIELD_TYPES = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
@@ -261,9 +261,9 @@ def _read_tensors(file: Any, weights: Weights) -> dict[str, Tensor]:
     with torch.device("meta"):  # without memory
         described = build_amvnet(weights.model, weights.taxonomy.size).state_dict()
     parameters = sum(tensor.numel() for tensor in described.values())
-    if parameters > MOST_PARAMETERS:  # parts that the file lacks are built as well
+    if parameters > MAX_PARAMETERS:  # parts that the file lacks are built as well
         raise InputError(
-            f"expected a model of at most {MOST_PARAMETERS:,} parameters, found {parameters:,}; "
+            f"expected a model of at most {MAX_PARAMETERS:,} parameters, found {parameters:,}; "
             "use other weights"
         )
 

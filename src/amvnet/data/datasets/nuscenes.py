@@ -60,8 +60,9 @@ class NuScenes(Dataset):
         version: "v1.0-mini", "v1.0-trainval" or "v1.0-test".
 
     Raises:
-        InputError: if `root` does not have this layout, has several versions and none is given, or
-            lacks a table.
+        InputError: if `root` does not have this layout.
+        InputError: if `root` has several versions, and `version` is not given.
+        InputError: if a table is missing or broken.
     """
 
     def __init__(self, root: Path | str, version: str | None = None) -> None:
@@ -202,7 +203,7 @@ class NuScenes(Dataset):
         return super().write_prediction(record, folder, ids, taxonomy, count)
 
     def _find_version(self, version: str | None) -> str:
-        """Return the version to read: the given one, or the only one in the folder."""
+        """Return the given version, or the only version in the folder."""
         folders = filter(Path.is_dir, self.root.glob("v1.0-*"))
         present = sorted(folder.name for folder in folders)
         if version is None and len(present) == 1:
@@ -219,7 +220,7 @@ class NuScenes(Dataset):
         )
 
     def _table(self, name: str, required: bool = True) -> list[Row]:
-        """Read one table; return no rows if an optional one is missing."""
+        """Read one table; return no rows if an optional table is missing."""
         path = self.root / self.version / f"{name}.json"
         if not path.is_file():
             if not required:
@@ -248,7 +249,7 @@ class NuScenes(Dataset):
             if "index" not in row or train_id is None:
                 raise InputError(
                     f"{path}: expected the categories of nuScenes-lidarseg, each with an index, "
-                    f"found {shown(row)}; replace the file by the one of nuScenes-lidarseg"
+                    f"found {shown(row)}; replace it by category.json of nuScenes-lidarseg"
                 )
             table[row["index"]] = train_id
         return table

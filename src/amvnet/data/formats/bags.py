@@ -15,7 +15,7 @@ from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
 from amvnet.errors import InputError
 
-LISTED_TOPICS = 10  # the most topics that an error message lists
+LISTED_TOPICS = 10  # largest number of topics that an error message lists
 
 CHUNK = 1 << 20  # the bytes that are unpacked at a time
 MIN_MESSAGE = 16  # the smallest size of a message in a bag, even if it is compressed, bytes

@@ -12,9 +12,10 @@ import numpy as np
 from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import FARTHEST, Scan, at_origin
 
-MAX_POINTS = 10_000_000  # the most points of a scan: 40 times as many as the largest sensors record
-MAX_BYTES = 32 * MAX_POINTS  # the most bytes to which the points of a packed file unpack
-MOST_RINGS = 256  # the most lasers; a column with larger values does not hold ring indices
+# Largest number of points of a scan: 40 times as many as the largest sensors record.
+MAX_POINTS = 10_000_000
+MAX_BYTES = 32 * MAX_POINTS  # largest size of the unpacked points of a packed file
+MAX_RINGS = 256  # largest number of lasers; a column with larger values does not hold ring indices
 
 # The largest intensity that a sensor can write: as a fraction, in 8 bits or in 16 bits.
 FLOAT_RANGES = (1.0, 255.0, 65535.0)
@@ -280,13 +281,13 @@ def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
     """Return values (N,) as int64 ring indices, with 0 in place of NaN and infinity.
 
     Return None if there are no values, if all are equal, or if one is negative, not whole or at
-    least `MOST_RINGS`.
+    least `MAX_RINGS`.
     """
     if values is None or not len(values):
         return None
 
     finite = np.where(np.isfinite(values), values, 0)
     is_whole = np.array_equal(finite, np.round(finite))
-    if not is_whole or not 0 <= finite.min() < finite.max() < MOST_RINGS:
+    if not is_whole or not 0 <= finite.min() < finite.max() < MAX_RINGS:
         return None
     return finite.astype(np.int64)

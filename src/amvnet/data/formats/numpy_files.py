@@ -32,9 +32,9 @@ from amvnet.errors import InputError
 
 # The possible names of the array of points in an archive with several arrays.
 KEYS = ("points", "positions", "xyz", "scan", "arr_0")
-# The most rows of an array that is taken for a transposed one, if it has more columns than this.
+# Largest number of rows of an array that is taken for a transposed one, if it has more columns.
 TRANSPOSED_ROWS = 10
-MOST_COLUMNS = 200  # the most columns of an array without names that are considered
+MAX_COLUMNS = 200  # largest number of columns of an array without names that are considered
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the compressions of NumPy's archives
 ADVICE = "save it again with np.save"
 ARCHIVE_ADVICE = "save it again with np.savez"
@@ -99,7 +99,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
 
 def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
-    numbers = range(min(array.shape[-1], MOST_COLUMNS))
+    numbers = range(min(array.shape[-1], MAX_COLUMNS))
     names = array.dtype.names or tuple(map(str, numbers))
 
     columns = {}

@@ -18,7 +18,7 @@ from amvnet.data.formats.detect import ARCHIVE, BAGS, FOLDER, GZIP, TEXT, ending
 from amvnet.errors import InputError
 
 CHUNK = 1 << 20  # the bytes that are unpacked at a time
-MOST_MEMBERS = 100_000  # the most files in an archive
+MAX_MEMBERS = 100_000  # largest number of files in an archive
 GZIPPED = "a scan file packed by gzip"
 ZIPPED = "an archive of scan files (.zip)"
 ADVICE = "copy it again, or unpack it"
@@ -42,9 +42,9 @@ def member_names(path: Path) -> list[str]:
     with reading(path, ZIPPED, ADVICE), zipfile.ZipFile(path) as archive:
         names = archive.namelist()
 
-    if len(names) > MOST_MEMBERS:
+    if len(names) > MAX_MEMBERS:
         raise InputError(
-            f"{path}: expected at most {MOST_MEMBERS:,} files, found {len(names):,}; unpack it"
+            f"{path}: expected at most {MAX_MEMBERS:,} files, found {len(names):,}; unpack it"
         )
     scans = sorted({name for name in names if _is_scan(name)})
     # As in a folder, text files count only if there are no other scans.

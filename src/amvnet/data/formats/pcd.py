@@ -71,7 +71,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
 
 def _read_header(file: BinaryIO, path: Path) -> dict[str, list[str]]:
-    """Return the words of each line of the header, up to DATA, by the line's first word."""
+    """Return the header up to DATA: the first word of each line, and its other words."""
     entries: dict[str, list[str]] = {}
     while "DATA" not in entries:
         words = read_header_line(file, path, KIND, "line DATA")
@@ -137,7 +137,7 @@ def unpack_lzf(data: bytes, size: int) -> bytearray:
             continue
 
         # A back reference has 3 bits of length and 13 bits of distance. If all 3 bits of the length
-        # are set, a byte to add to it follows.
+        # are set, the next byte is added to the length.
         length = (control >> 5) + 2
         if length == 9:
             length += data[position]

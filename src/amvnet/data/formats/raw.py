@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from amvnet.data.formats.cloud import MOST_RINGS, Cloud, check_point_count
+from amvnet.data.formats.cloud import MAX_RINGS, Cloud, check_point_count
 from amvnet.data.formats.rows import ADVICE, NAMES, UNKNOWN, RowLayout, are_rings, named_cloud
 from amvnet.errors import InputError, readable
 
@@ -154,7 +154,7 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     intensity = table[:, 3]
     ring = table[:, 4]
 
-    if not (ring == np.round(ring)).all() or not 0 <= ring.min() < ring.max() < MOST_RINGS:
+    if not (ring == np.round(ring)).all() or not 0 <= ring.min() < ring.max() < MAX_RINGS:
         return False
     if not _are_intensities(intensity).all() or np.array_equal(xyz, np.round(xyz)):
         return False

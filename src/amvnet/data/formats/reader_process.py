@@ -34,10 +34,10 @@ except ImportError:  # Windows has no limits
     resource = None  # type: ignore[assignment]
 
 # The limits grow with the size of the file.
-MEMORY = 700 << 20  # the most memory of the process for an empty file, bytes
+MEMORY = 700 << 20  # largest memory of the process for an empty file, bytes
 MEMORY_PER_BYTE = 10  # the additional memory for each byte of the file, bytes
-MOST_MEMORY = 4 << 30  # the most memory of the process for any file, bytes
-SECONDS = 5.0  # the most processor time for an empty file, seconds
+MAX_MEMORY = 4 << 30  # largest memory of the process for any file, bytes
+SECONDS = 5.0  # largest processor time for an empty file, seconds
 BYTES_PER_SECOND = 3e6  # the bytes of the file for which the process gets an additional second
 DISK = 64 << 20  # the largest temporary file for an empty file, bytes
 DISK_PER_BYTE = 20  # the additional size of a temporary file for each byte of the file, bytes
@@ -204,7 +204,7 @@ def _set_limits(size: int) -> None:
         return
     usage = resource.getrusage(resource.RUSAGE_SELF)
     seconds = usage.ru_utime + usage.ru_stime + SECONDS + size / BYTES_PER_SECOND
-    _limit(resource.RLIMIT_DATA, min(MEMORY + MEMORY_PER_BYTE * size, MOST_MEMORY))
+    _limit(resource.RLIMIT_DATA, min(MEMORY + MEMORY_PER_BYTE * size, MAX_MEMORY))
     _limit(resource.RLIMIT_CPU, math.ceil(seconds))
     _limit(resource.RLIMIT_FSIZE, DISK + DISK_PER_BYTE * size)
 

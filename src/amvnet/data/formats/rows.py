@@ -18,7 +18,7 @@ ADVICE = "say what the rows hold, for example --columns x,y,z,intensity,ring --d
 # many points as the mean ring; the largest class has at least 2.8 times as many as the mean class.
 # The variance of the elevations within a ring is at most 0.06 of their variance in the scan; within
 # a class it is at least 0.34.
-LARGEST_RING = 2.5  # the most points of a ring, relative to the mean ring
+LARGEST_RING = 2.5  # largest number of points of a ring, relative to the mean ring
 FEWEST_LASERS = 8  # the fewest lasers; fewer classes may also have similar numbers of points
 # The largest variance of the elevations within a ring, relative to their variance in the scan.
 ELEVATION_SPREAD = 0.1

@@ -24,7 +24,7 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns,
 from amvnet.errors import InputError
 
 HEAD = 65_536  # the size of the head of a file, which must hold the first points, bytes
-MOST_COLUMNS = 200  # the most columns of a line that are considered
+MAX_COLUMNS = 200  # largest number of columns of a line that are considered
 CHECKED_LINES = 20  # the number of lines that are checked to have the same columns
 UNNAMED_COLUMNS = 7  # the number of columns that are read if they have no names
 COMMENTS = ("#", "//", "%")  # the marks that begin a comment
@@ -163,7 +163,7 @@ def _match(lines: list[str], separator: str | None) -> TextTable | None:
 
 def _split(line: str, separator: str | None) -> list[str]:
     """Return the values of a line. A separator at the end of the line adds no empty value."""
-    return line.strip().removesuffix(separator or "").split(separator, MOST_COLUMNS)
+    return line.strip().removesuffix(separator or "").split(separator, MAX_COLUMNS)
 
 
 def _uncomment(line: str) -> str:

@@ -4,7 +4,7 @@
 const ATTRIBUTES = { position: 0, intensity: 1, disagreement: 2, label: 3, truth: 4, uncertain: 5 };
 const RINGS = [10, 20, 30, 40, 50], SIDES = 180;  // the radii of the rings on the ground, metres, and their corners
 // The most pixels of the canvas. For smooth edges, it has up to twice the window's resolution.
-const MOST_PIXELS = 6e6;
+const MAX_PIXELS = 6e6;
 
 class Drawing {
   constructor(canvas) {
@@ -91,7 +91,7 @@ class Drawing {
 
   resize() {
     const gl = this.gl, { clientWidth, clientHeight } = this.canvas;
-    const finer = Math.sqrt(MOST_PIXELS / Math.max(clientWidth * clientHeight, 1));
+    const finer = Math.sqrt(MAX_PIXELS / Math.max(clientWidth * clientHeight, 1));
     const ratio = Math.min(Math.max(window.devicePixelRatio || 1, finer), 2);
     const width = Math.max(1, Math.round(clientWidth * ratio)), height = Math.max(1, Math.round(clientHeight * ratio));
     this.ratio = ratio;
