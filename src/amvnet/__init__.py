@@ -82,8 +82,8 @@ def load(
             "auto", which is bfloat16 on a GPU that supports it, else float32. The projections are
             computed in float64, everything else in float32.
         engine: the program that runs the networks: "torch", "onnx" or "int8".
-        tau: the highest cosine similarity of the two networks' class probabilities at which a point
-            is uncertain, in [0, 1]. By default, it is the threshold of the weights.
+        tau: a point is uncertain if the cosine similarity of the two networks' class probabilities
+            is at most tau, in [0, 1]. By default, it is the threshold of the weights.
         graphs: on a GPU, capture the networks as CUDA graphs.
         report: called with a line that names the device, and with a line before long work.
 

@@ -117,12 +117,13 @@ class TrainingChoice:
 
         scans = split_records(dataset, self.train_sequences, self.val_sequences, with_val)
         if scans.unlabelled:
-            report(f"skipped, as they have no labels: {describe_records(scans.unlabelled)}")
+            report(f"skipped for lack of labels: {describe_records(scans.unlabelled)}")
         if isinstance(dataset, OwnScans):
             used = {record.name for record in (*scans.train, *scans.val)}
             unnamed = [record for record in dataset.left_out() if record.name not in used]
             if unnamed:
-                report(f"not used, as the split does not name them: {describe_records(unnamed)}")
+                text = describe_records(unnamed)
+                report(f"not used, because the split does not name them: {text}")
         return scans
 
     def splits(self, dataset: Dataset) -> Iterator[tuple[str, Sequence[ScanRecord]]]:
@@ -139,7 +140,7 @@ class TrainingChoice:
 
 @dataclass(frozen=True)
 class SensorChoice:
-    """What is known of the sensor of scan files; the rest is measured."""
+    """What is known about the sensor of scan files; the rest is measured."""
 
     sensor: str | None = None
     """the name of the LiDAR (vlp16, os1-64, ...), or a YAML file; default: measured."""
@@ -177,8 +178,8 @@ class LabelChoice:
     method: MethodName = "amvnet"
     """the whole of AMVNet, or a part of it."""
     tau: Share | None = None
-    """the highest cosine similarity of the two networks' probabilities at which a point goes to the
-    head, in [0, 1]; a lower value takes less time; default: the value in the weights."""
+    """a point goes to the head if the cosine similarity of the two networks' probabilities is at
+    most this value, in [0, 1]; a lower value takes less time; default: the value in the weights."""
     format: FormatName = "label"
     """the format of the labels of scan files: raw ids (label, npy), or coloured points (ply)."""
     classes: str | None = None
@@ -189,14 +190,14 @@ class LabelChoice:
     """also write NAME.uncertain.npy, which marks the points on which the two networks disagree."""
 
     def parse(
-        self, weights: Weights, choice: ScanChoice, known: SensorChoice, compute: Compute
+        self, weights: Weights, choice: ScanChoice, sensor_choice: SensorChoice, compute: Compute
     ) -> LabellingRequest:
         """Return the request for labels by some weights.
 
         Args:
             weights: the weights.
             choice: which scans to read, and how files hold them.
-            known: what is known of the sensor.
+            sensor_choice: what is known about the sensor.
             compute: where and how the networks are computed.
 
         Raises:
@@ -211,7 +212,7 @@ class LabelChoice:
             self.tau,
             precision=compute.precision,
             engine=compute.engine,
-            sensor=known.parse(),
+            sensor=sensor_choice.parse(),
             layout=choice.parse().layout,
             topic=choice.topic,
             classes=None if self.classes is None else class_map(self.classes),

@@ -21,9 +21,9 @@ from amvnet.files import atomic_write
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 
-SHOWN_PROBLEMS = 5  # largest number of unknown ids that a message lists
-# The largest file of remembered contents that is read, bytes. 20,000 scans need 5 million bytes.
-LARGEST_MEMORY = 200_000_000
+SHOWN_IDS = 5  # largest number of unknown ids that a message lists
+# Largest size of a file of `Memory` that is read, bytes. 20,000 scans need 5 million bytes.
+MAX_MEMORY_BYTES = 200_000_000
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class SplitReport:
 
         Args:
             record: the scan.
-            contents: what it holds.
-            lookup: train ids by raw id; UNKNOWN for raw ids that are not expected.
+            contents: what the scan holds.
+            lookup: train ids by raw id; UNKNOWN for raw ids that the dataset does not define.
         """
         self.scans.append(record.name)
         counts = np.zeros_like(self.points)
@@ -102,7 +102,7 @@ class Report:
     """The contents of the labelled scans of a dataset, by split.
 
     Attributes:
-        spec: the text with which the dataset is opened.
+        spec: the text by which `open_dataset` opens the dataset.
         taxonomy: the classes of the dataset.
         splits: the report of each split, by the name of the split.
         contents: what each scan holds, by the name of the scan; broken scans are left out.
@@ -131,13 +131,13 @@ class Report:
     @property
     def unknown(self) -> dict[int, UnknownId]:
         """The raw ids that are neither in a class nor ignored, over all splits."""
-        total: dict[int, UnknownId] = {}
+        totals: dict[int, UnknownId] = {}
         for split in self.splits.values():
             for raw_id, entry in split.unknown.items():
-                sum_of_id = total.setdefault(raw_id, UnknownId(example=entry.example))
-                sum_of_id.points += entry.points
-                sum_of_id.scans += entry.scans
-        return dict(sorted(total.items()))
+                total = totals.setdefault(raw_id, UnknownId(example=entry.example))
+                total.points += entry.points
+                total.scans += entry.scans
+        return dict(sorted(totals.items()))
 
     def errors(self) -> Iterator[str]:
         """Yield a line for each error that must be corrected before a training.
@@ -151,12 +151,8 @@ class Report:
             )
         unknown = self.unknown
         if unknown:
-            texts = [describe_unknown(*item) for item in list(unknown.items())[:SHOWN_PROBLEMS]]
-            more = (
-                f" and {len(unknown) - SHOWN_PROBLEMS} more"
-                if len(unknown) > SHOWN_PROBLEMS
-                else ""
-            )
+            texts = [describe_unknown(*item) for item in list(unknown.items())[:SHOWN_IDS]]
+            more = f" and {len(unknown) - SHOWN_IDS} more" if len(unknown) > SHOWN_IDS else ""
             yield (
                 f"{self.spec}: expected ids of classes or of ignored points, found "
                 f"{', '.join(texts)}{more}; {_advice(self.taxonomy)}"
@@ -186,7 +182,7 @@ class Report:
             if split.unlabelled:
                 total = len(split.unlabelled) + len(split.scans) + len(split.broken)
                 yield (
-                    f"{name}: skipped, as they have no labels: {len(split.unlabelled)} of "
+                    f"{name}: skipped for lack of labels: {len(split.unlabelled)} of "
                     f"{counted(total, 'scan')}, such as {split.unlabelled[0]}"
                 )
             absent = [
@@ -204,14 +200,14 @@ def check_scans(
 ) -> Report:
     """Read all labelled scans of some splits, and report what they hold.
 
-    Several threads read scans. The user's cache remembers what they hold, as long as the files do
-    not change; the classes may change.
+    Several threads read the scans. The user's cache remembers their raw ids until their files
+    change; other classes need no new reading.
 
     Args:
         dataset: the dataset.
         splits: the scans by the name of the split; scans without labels are only counted.
         progress: called with the number of this process's scans that are done, and their total.
-        processes: the processes that share the scans; each returns the report on all scans.
+        processes: the processes that share the scans; each process returns the report on all scans.
     """
     labelled = {}
     for records in splits.values():
@@ -250,12 +246,13 @@ def _find_contents(
         records: labelled scans by name.
     """
     memory = Memory(dataset)
-    # All processes take what the first one recalls: another might already see what is kept below.
+    # All processes take what the first one recalls: a later process might recall other scans,
+    # because the first one keeps new scans below.
     known = processes.gather(memory.recall(list(records.values())))[0]
     found: dict[str, Contents | str] = {**known}
     unread = [record for name, record in records.items() if name not in known]
-    # The states are taken before the scans are read, so that contents that change while they are
-    # read are not remembered for the changed file.
+    # Take the states before the scans are read. If a file changes during the reading, its contents
+    # are then remembered for the old state, and read again the next time.
     states = {name: _state_of(record) for name, record in records.items()}
     for part in processes.gather(_read_all(dataset, processes.share(unread), progress)):
         found |= part
@@ -267,7 +264,7 @@ def _find_contents(
 
 
 def describe_unknown(raw_id: int, entry: UnknownId) -> str:
-    """Describe how often an unknown id occurs, and in which file."""
+    """Return in words how often an unknown id occurs, and in which file."""
     points = f"{entry.points:,} point{'' if entry.points == 1 else 's'}"
     return f"{raw_id} ({points} in {counted(entry.scans, 'scan')}, such as {entry.example})"
 
@@ -318,10 +315,10 @@ def _contents_of(dataset: Dataset, record: ScanRecord) -> Contents:
 
 
 class Memory:
-    """Remembers in the user's cache what the scans of a dataset hold, until their files change.
+    """A memory in the user's cache of what the scans of a dataset hold, until their files change.
 
-    If the cache cannot be read or written, or if another user can write it, nothing is remembered.
-    This costs only time.
+    If the cache cannot be read or written, or if another user can write it, nothing is remembered,
+    which only costs time.
     """
 
     def __init__(self, dataset: Dataset) -> None:
@@ -335,7 +332,7 @@ class Memory:
         entries: Any = None
         with suppress(OSError, ValueError, RecursionError):
             is_private = shared_with_others(self.path.parent) is None
-            if is_private and self.path.stat().st_size <= LARGEST_MEMORY:
+            if is_private and self.path.stat().st_size <= MAX_MEMORY_BYTES:
                 entries = json.loads(self.path.read_text(encoding="utf-8"))
         self._entries = entries if isinstance(entries, dict) else {}
 

@@ -106,7 +106,7 @@ def normaliser_for(
     """Return the normaliser of scan files for some weights.
 
     Args:
-        sensor: what is known of the sensor; the rest is measured.
+        sensor: what is known about the sensor; the rest is measured.
         report: takes a line about what was assumed of the sensor.
     """
     return Normaliser(expectation_of(weights), sensor, report)

@@ -35,7 +35,7 @@ class LabellingRequest(Checked):
         weights: trained weights.
         method, tau, precision: as `amvnet.load` takes them.
         engine: the name of the engine that runs the networks.
-        sensor: what is known of the sensor of scan files; the rest is measured.
+        sensor: what is known about the sensor of scan files; the rest is measured.
         layout: the names of the columns in files that do not name them.
         topic: the topic to read in bags; None selects the only one with scans.
         classes: maps the classes of the weights to the classes that are written. By default, the

@@ -24,7 +24,8 @@ def ablate(
     Args:
         recipe: the name of a built-in recipe, or a YAML file.
         data: the dataset.
-        out: folder for the four runs and the table; a second call continues an interrupted one.
+        out: folder for the four runs and the table. If the folder has an interrupted ablation, the
+            call continues it.
         choice: which scans to train on, and which to score.
         device: the device that scores the trained networks: cpu, cuda, cuda:1, ..., or auto, which
             is cuda if there is a GPU.

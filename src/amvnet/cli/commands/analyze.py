@@ -33,14 +33,14 @@ def analyze(
 
     Args:
         data: the dataset, with labels.
-        weights: a weights file, or the name of a built-in one.
+        weights: a weights file, or the name of built-in weights.
         out: folder for the diagrams (PNG), and their figures (CSV).
         choice: which scans to score.
         compute: where and how the networks are computed.
         neighbours: numbers of neighbours, separated by commas; a head is trained for each of them
             (Fig. 8b); needs --recipe.
-        taus: thresholds, separated by commas; a head is trained for each of them (Fig. 8a); with a
-            threshold of 1, it learns from all kinds of points; needs --recipe.
+        taus: thresholds, separated by commas; a head is trained for each of them (Fig. 8a), for 1 a
+            head that learns from all points, not only uncertain ones; needs --recipe.
         recipe: the recipe of these heads: the name of a built-in recipe, or a YAML file.
         train_sequences: sequences or scenes that these heads learn from, separated by commas;
             default: the official split.
@@ -67,10 +67,10 @@ def analyze(
     dataset = normalised(open_dataset(data, loaded.taxonomy), normaliser_for(loaded))
     records = choice.records(dataset)
 
-    # Before any scan is scored, so that no time is wasted if the study cannot be made.
-    asked = {"neighbours": neighbours, "taus": taus}
-    studied = [name for name, values in asked.items() if values]
-    outputs = charts.files_of(out, (*charts.FIGURES, *studied), charts.TABLES)
+    # Check this before any scan is scored, so that no time is wasted if the study cannot be made.
+    sweeps = {"neighbours": neighbours, "taus": taus}
+    sweep_names = [name for name, values in sweeps.items() if values]
+    outputs = charts.files_of(out, (*charts.FIGURES, *sweep_names), charts.TABLES)
     check_outputs(outputs, [data, weights, recipe], overwrite)
     plan = None
     if recipe is not None:
@@ -92,9 +92,9 @@ def analyze(
             ("neighbours", "neighbours", model.point_head.neighbours, by_count),
             ("tau", "taus", model.assertion.threshold, by_tau),
         )
-        for parameter, name, used, models in studies:
+        for parameter, name, own_value, models in studies:
             if models:
                 study = replace(plan, out=out / name)
                 rows = list(sweep_heads(study, models, loaded, segmenter.device))
-                written += charts.write_sweep(rows, parameter, used, data, out / name)
+                written += charts.write_sweep(rows, parameter, own_value, data, out / name)
     report(f"{counted(len(written), 'file')} in {out}")

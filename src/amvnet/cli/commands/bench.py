@@ -24,12 +24,12 @@ def bench(
 
     Args:
         compute: where and how the networks are computed; one scan is timed at a time.
-        weights: a weights file, or the name of a built-in one.
+        weights: a weights file, or the name of built-in weights.
         scan: the file of the scan; default: a simulated scan.
         runs: the number of timed runs, after two warm-up runs; the table shows medians and
             quartiles.
-        tau: the highest cosine similarity of the two networks' probabilities at which a point is
-            uncertain, in [0, 1]; default: the value in the weights.
+        tau: a point is uncertain if the cosine similarity of the two networks' probabilities is at
+            most this value, in [0, 1]; default: the value in the weights.
         json: also write the figures to this file.
         overwrite: replace this file if it exists.
     """
@@ -44,7 +44,7 @@ def bench(
     if json is not None:
         check_outputs({json: FIGURES}, [weights, scan], overwrite)
     if scan is not None:
-        read_cloud(scan)  # before the networks are loaded, which may take long
+        read_cloud(scan)  # reports a broken scan before the networks are loaded
     segmenter = load_segmenter(weights, "amvnet", compute, tau)
 
     with temporary_folder() as folder:

@@ -20,8 +20,8 @@ def demo(
 
     Args:
         out: folder for the scans, the page and the figures.
-        seed: the seed of the streets; the built-in weights were not trained on the default's.
-        weights: a weights file, or the name of a built-in one.
+        seed: the seed of the streets; the built-in weights have not seen the default streets.
+        weights: a weights file, or the name of built-in weights.
         overwrite: replace the page and the figures if they exist.
     """
     from amvnet import load

@@ -37,17 +37,17 @@ def evaluate(
         data: the dataset.
         choice: which scans to score.
         compute: where and how the networks are computed.
-        weights: a weights file, or the name of a built-in one.
+        weights: a weights file, or the name of built-in weights.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
-        methods: the methods of the weights to score, separated by commas; rv-knn is rv with a vote
+        methods: with --weights, the methods to score, separated by commas; rv-knn is rv with a vote
             of neighbours in the range image, arithmetic and maximum are the other ensembles.
-        tau: the highest cosine similarity of the two networks' probabilities at which a point goes
-            to the head, in [0, 1]; a lower value takes less time; default: the value in the
+        tau: a point goes to the head if the cosine similarity of the two networks' probabilities is
+            at most this value, in [0, 1]; a lower value takes less time; default: the value in the
             weights.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
-        classes: other classes to score, to which the classes of the data and of the weights are
-            mapped: coarse, or a YAML file.
+        classes: the classes to score instead of the dataset's: coarse, or a YAML file that maps the
+            classes of the data and of the weights to them.
         overwrite: replace figures and drawings that exist.
     """
     from amvnet.data.class_maps import class_map
@@ -93,7 +93,7 @@ def evaluate(
     for path in (json, pictures):
         if path is not None:
             make_folder(path.parent)
-    # No process writes a drawing before all have checked that there are none.
+    # Another process might take a drawing of this run for one that existed before.
     processes.wait()
     with progress("scoring") as step:
         evaluation = evaluate_records(

@@ -11,7 +11,7 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
     """Write the networks and the head as ONNX graphs, with a JSON that a C++ program can follow.
 
     Args:
-        weights: a weights file, or the name of a built-in one.
+        weights: a weights file, or the name of built-in weights.
         out: folder for the graphs and amvnet.json.
         int8: scans that calibrate convolutions in 8-bit integers, for CPUs: a dataset, scan files
             or a folder of them as predict takes them, or the word simulated; default: float32.

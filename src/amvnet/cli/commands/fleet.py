@@ -15,7 +15,7 @@ def fleet(
     /,
     weights: str,
     out: str,
-    known: SensorChoice,
+    sensor_choice: SensorChoice,
     compute: Compute,
     labels: LabelChoice,
     columns: str | None = None,
@@ -29,24 +29,25 @@ def fleet(
 
     Args:
         inputs: folders of scan files, scan files, or manifests (.parquet, .csv): URLs or paths.
-        weights: a weights file, or the name of a built-in one.
+        weights: a weights file, or the name of built-in weights.
         out: folder for the labels, a URL or a path; it must be new unless --resume is given.
-        known: what is known of the sensor of scan files.
+        sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
         labels: how points are labelled, and which files are written.
         columns: the columns of .bin, .npy and text files in their order, as predict takes them.
         dtype: the type of the numbers in .bin files, as predict takes it.
-        batch: scans that go through the networks at a time; more than one suits a GPU.
-        resume: continue an earlier run in the folder, with the same weights and options; only scans
-            that are new, failed, or have lost their labels are labelled.
-        address: the Ray cluster: auto, ray://HOST:10001, ...; default: Ray starts on this machine.
-        workers: the highest number of workers; default: one for each GPU, or for each 4 cores.
+        batch: number of scans that go through the networks together; more than one suits a GPU.
+        resume: continue an earlier run in the folder, with the same weights and options; label only
+            scans that are new, that failed or whose labels are missing.
+        address: address of the Ray cluster: auto, ray://HOST:10001, ...; default: start Ray on this
+            machine.
+        workers: largest number of workers; default: one for each GPU, or for each 4 cores.
     """
     from amvnet.weights.file import load
 
     pipeline = import_optional("amvnet.fleet.pipeline", "fleet")
     choice = ScanChoice(columns=columns, dtype=dtype)
-    request = labels.parse(load(weights), choice, known, compute)
+    request = labels.parse(load(weights), choice, sensor_choice, compute)
     with progress("labelling") as step:
         written = pipeline.label_fleet(
             inputs,

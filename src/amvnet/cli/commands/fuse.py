@@ -29,11 +29,11 @@ def fuse(
         inputs: datasets, scan files, or folders of scans.
         out: folder for the labels.
         models: the scores of the two models.
-        choice: which scans of the inputs.
-        head: weights with a point head that was trained on these scores or on networks; default: no
-            head, but the ensemble.
-        tau: the highest cosine similarity of the two models' scores at which a point is uncertain,
-            in [0, 1]; default: the value in the head's weights.
+        choice: which scans of the inputs to label.
+        head: weights with a point head that was trained on these scores or on networks; default:
+            the ensemble, without a head.
+        tau: a point is uncertain if the cosine similarity of the two models' scores is at
+            most this value, in [0, 1]; default: the value in the head's weights.
         taxonomy: the classes; default: the classes of the head or of the inputs.
         overwrite: replace files that exist.
     """

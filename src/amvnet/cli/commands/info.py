@@ -9,7 +9,7 @@ def info(weights: str | None = None, /) -> None:
     """Print the model card of a weights file in Markdown; without a file, show what is installed.
 
     Args:
-        weights: a weights file, or the name of a built-in one.
+        weights: a weights file, or the name of built-in weights.
     """
     from amvnet.cli.tables import installation_table
     from amvnet.weights.card import BUILT_IN_LICENCE, model_card

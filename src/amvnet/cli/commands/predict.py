@@ -22,7 +22,7 @@ def predict(
     weights: str,
     out: str,
     choice: ScanChoice,
-    known: SensorChoice,
+    sensor_choice: SensorChoice,
     compute: Compute,
     labels: LabelChoice,
     batch: Count = 1,
@@ -33,15 +33,15 @@ def predict(
 
     Args:
         inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
-        weights: a weights file, or the name of a built-in one.
+        weights: a weights file, or the name of built-in weights.
         out: folder for the labels.
-        choice: which scans of the inputs.
-        known: what is known of the sensor of scan files.
+        choice: which scans of the inputs to segment.
+        sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
         labels: how points are labelled, and which files are written.
-        batch: scans that go through the networks at a time; more than one suits a GPU.
-        resume: continue an earlier run in the folder, with the same weights and options; only scans
-            that are new or were not done are segmented.
+        batch: number of scans that go through the networks together; more than one suits a GPU.
+        resume: continue an earlier run in the folder, with the same weights and options; segment
+            only scans that are new or were not finished.
         overwrite: replace files that exist.
     """
     from amvnet.inference.predict import predict as predict_inputs
@@ -50,7 +50,7 @@ def predict(
     for text in (*inputs, out):
         if "://" in text:
             raise InputError(f"{text}: expected a path, found a URL; use amvnet fleet")
-    request = labels.parse(load(weights), choice, known, compute)
+    request = labels.parse(load(weights), choice, sensor_choice, compute)
 
     def make_segmenter() -> Segmenter:
         return load_segmenter(request.weights, request.method, compute, request.tau)
@@ -66,7 +66,7 @@ def predict(
             batch=batch,
             overwrite=overwrite,
             resume=resume,
-            also_read=(*inputs, weights, labels.classes, known.sensor),
+            also_read=(*inputs, weights, labels.classes, sensor_choice.sensor),
             progress=step,
             report=report,
         )

@@ -23,7 +23,7 @@ def rank(
 
     Args:
         data: the dataset, with labels.
-        weights: a weights file with both networks, or the name of a built-in one.
+        weights: a weights file with both networks, or the name of built-in weights.
         out: the file of the table, FILE.csv.
         choice: which scans to rank.
         compute: where and how the networks are computed.

@@ -29,19 +29,19 @@ def train(
         data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts;
             a YAML file that describes scans and classes of your own (docs/own_data.md);
             simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
-            the training, with their cache in the folder. If several are given, the first one is
+            the training and cached in the folder. If several are given, the first one is
             split and validated, and the training scans of the others are mixed in: all of them, or
             as many as --training.others says.
         out: folder of the run.
         choice: which scans to train on and to validate with.
-        models: with --stage head, two models to train a head for.
+        models: with --stage head, the scores of two other models to train a head on.
         stage: which part to train; all trains one part after the other.
-        init: weights to begin with; parts that are not trained are copied. If they have other
-            classes, all layers except the last ones are copied. Stages that the folder already has
-            keep their own weights.
+        init: weights to begin with; parts that are not trained are copied. From weights with other
+            classes, all layers except the last ones are copied. Stages that the folder has finished
+            keep the weights of the folder.
         resume: continue an earlier run in the folder.
-        with_val: also train on the scans to validate with, and validate nothing, as for a
-            benchmark's server.
+        with_val: also train on the validation scans, and skip the validation, as for an entry to a
+            benchmark.
     """
     from amvnet.models.methods import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
@@ -73,5 +73,5 @@ def train(
     line = f"weights in {path}"
     parts = load(path).parts
     if stage != "head" and set(BOTH_NETWORKS) <= set(parts) and "point_head" not in parts:
-        line += "; they have no point head, which the same command with --stage head trains"
+        line += "; they have no point head yet: train it by the same command with --stage head"
     report(line)

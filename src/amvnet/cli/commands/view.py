@@ -16,7 +16,7 @@ def view(
     inputs: list[str],
     /,
     choice: ScanChoice,
-    known: SensorChoice,
+    sensor_choice: SensorChoice,
     compute: Compute,
     labels: Path | None = None,
     weights: str | None = None,
@@ -29,15 +29,15 @@ def view(
 
     Args:
         inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
-        choice: which scans of the inputs.
-        known: what is known of the sensor of scan files.
+        choice: which scans of the inputs to show.
+        sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
         labels: a folder of labels as predict writes them, in any of its formats, or the label file
             of a single scan.
-        weights: a weights file, or the name of a built-in one, instead of labels; the page shows
-            the labels of every method.
+        weights: a weights file, or the name of built-in weights, instead of labels. The page then
+            shows the labels of every method.
         html: the page to write; default: a temporary page, which opens in the browser.
-        scans: the highest number of scans, which are evenly spaced.
+        scans: largest number of scans; they are evenly spaced in the inputs.
         taxonomy: the classes of labels that belong to no dataset.
         overwrite: replace the page if it exists.
     """
@@ -61,10 +61,10 @@ def view(
         )
     if scans < 1:
         raise InputError(f"expected --scans of 1 or more, found {scans}; give --scans 5")
-    sensor = known.parse()
+    sensor = sensor_choice.parse()
     # Check this before any scan is segmented, so that no time is wasted.
     if html is not None:
-        check_outputs({html: PAGE}, [*inputs, labels, weights, known.sensor], overwrite)
+        check_outputs({html: PAGE}, [*inputs, labels, weights, sensor_choice.sensor], overwrite)
         make_folder(html.parent)
 
     classes = None if taxonomy is None else TAXONOMIES[taxonomy]
