@@ -108,7 +108,10 @@ def test_the_help_of_train_has_every_value_of_the_recipe_with_its_meaning(
     with pytest.raises(SystemExit):
         main(["train", "simulated-compact", "--help-all"])
     text = " ".join(capsys.readouterr().out.split())
-    assert "--training.rv.epochs EPOCHS Passes over the training scans. (default: 10)" in text
+    assert (
+        "--training.rv.epochs EPOCHS Number of passes over the training scans. (default: 10)"
+        in text
+    )
     assert "--model.range_view: The range image" in text
     for key, words in field_texts(type(ModelConfig().polar_net)).items():
         assert f"--model.polar_net.{key} " in text
