@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from amvnet.cli.console import report, report_fault
@@ -42,6 +44,23 @@ def test_user_names_passwords_and_keys_are_cut_from_urls() -> None:
 def test_all_else_stays() -> None:
     for text in (*HARMLESS, *SECRETS.values()):
         assert without_secrets(text) == text
+
+
+LONG = (
+    "s3://" + "k" * 100_000,
+    "a://b:" * 16_000,
+    "@" + "a://b:" * 16_000,
+    "a://b:1/" * 12_000 + "@",
+    "s3://a?" + "key" * 33_000,
+    "s3://a" + "?key" * 25_000,
+)
+
+
+@pytest.mark.parametrize("text", LONG, ids=range(len(LONG)))
+def test_a_long_text_takes_little_time(text: str) -> None:
+    start = time.process_time()
+    without_secrets(text)
+    assert time.process_time() - start < 2  # seconds; it was a minute
 
 
 def test_nothing_that_is_printed_has_secrets(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ Names are imported when they are first used, so that `import amvnet` is fast.
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -50,6 +51,10 @@ __all__ = ["load", *_MODULES]
 __version__ = version("amvnet")
 
 _SUBMODULES = ("onnx_runner", "weights")
+
+# ONNX Runtime from 1.29 on would report the graphs that it runs to Microsoft. It reads this
+# variable when it is imported.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
 def load(

@@ -90,13 +90,16 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
         parent: the folder in which it is made. By default, it is the system's temporary folder.
     """
     if parent is None:
-        folder = Path(tempfile.mkdtemp(prefix="amvnet-"))
+        folder = Path(tempfile.gettempdir()) / f"amvnet-{uuid.uuid4().hex}"
     else:
         folder = parent / f".{uuid.uuid4().hex}.part"
-        make_folder(folder)
 
-    unfinished.add(folder)
+    unfinished.add(folder)  # before the folder is made, because the process may exit at any time
     try:
+        if parent is None:
+            folder.mkdir(0o700)
+        else:
+            make_folder(folder)
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)

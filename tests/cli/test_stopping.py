@@ -162,6 +162,70 @@ def test_a_signal_during_an_import_raises_nothing_in_it() -> None:
     assert (done.returncode, done.stderr) == (143, "amvnet: stopped\n")
 
 
+STARTING = """
+import signal, sys
+from importlib.abc import MetaPathFinder
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it ignored
+
+class Finder(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name == "amvnet.cli.main":
+            signal.raise_signal(signal.SIGINT)
+
+from amvnet.__main__ import main
+sys.meta_path.insert(0, Finder())
+sys.argv = ["amvnet", "list"]
+sys.exit(main())
+"""
+
+
+def test_an_interrupted_start_has_no_traceback() -> None:
+    """A process that a signal has ended has the exit code 130 in a shell."""
+    done = subprocess.run(
+        [sys.executable, "-c", STARTING], capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+WITH_SEMAPHORE = """
+import sys, time
+from multiprocessing import get_context
+from amvnet.cli import main
+
+def wait():
+    'Wait.'
+    lock = get_context("spawn").Lock()
+    print("ready", flush=True)
+    while True:
+        try:
+            time.sleep(60)
+        except KeyboardInterrupt:
+            pass
+
+main.COMMANDS["list"] = wait
+sys.argv = ["amvnet", "list"]
+sys.exit(main.main())
+"""
+
+
+@pytest.mark.parametrize("given", ["", "error::SyntaxWarning"])
+def test_semaphores_of_a_stopped_command_are_cleaned_up_in_silence(given: str) -> None:
+    """Pools of processes have semaphores. Python's tracker of them would warn."""
+    with subprocess.Popen(
+        [sys.executable, "-c", WITH_SEMAPHORE],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONWARNINGS": given},
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.stderr.read() == "amvnet: stopped\n"
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights, scans that take seconds, and the labels of `predict`."""

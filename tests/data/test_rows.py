@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -347,6 +348,34 @@ def test_patterns_of_any_folders_follow_links_once(table: np.ndarray, tmp_path: 
     data = open_dataset(str(path))
     records = data.records(data.sequences("all"))
     assert [record.points_path for record in records] == expected
+
+
+@pytest.mark.parametrize("has_circles", [False, True])
+def test_several_any_folders_in_a_pattern_take_little_time(
+    has_circles: bool, table: np.ndarray, tmp_path: Path
+) -> None:
+    folder = tmp_path
+    for _ in range(12):
+        folder /= "d"
+        folder.mkdir()
+        if has_circles:
+            (folder / "up").symlink_to(tmp_path)
+    (folder / "0.bin").write_bytes(row_bytes(table[:, :4], "float32"))
+    (tmp_path / "own.yaml").write_text(f'classes: {{a: 1}}\nscans: "{"**/" * 7}*.bin"\n')
+
+    start = time.process_time()
+    data = open_dataset(str(tmp_path / "own.yaml"))
+    (record,) = data.records(data.sequences("all"))
+    assert record.points_path == folder / "0.bin"
+    assert find_scans(tmp_path / "**/d/**/d/**/d/**/d/**/*.bin") == [folder / "0.bin"]
+    assert time.process_time() - start < 5  # seconds; it was a minute
+
+
+def test_a_long_name_of_a_column_takes_little_time() -> None:
+    line = "x" + " " * 60_000 + "y"
+    start = time.process_time()
+    assert find_table(f"{line}\n1,2,3\n4,5,6\n".encode()) is not None
+    assert time.process_time() - start < 2  # seconds; it was half a minute
 
 
 def test_equally_frequent_labels_with_gaps_are_no_rings() -> None:

@@ -22,6 +22,7 @@ from amvnet.cache import user_cache
 from amvnet.engines.onnx import RANGE_NET, UNET
 from amvnet.export import cache
 from amvnet.export.cache import cached_networks
+from amvnet.files import unfinished
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS_BY_METHOD
 from amvnet.weights.file import Weights
 
@@ -241,14 +242,23 @@ def test_a_cache_of_another_user_is_not_used(
 def test_without_a_place_for_a_cache_the_networks_are_exported_for_one_run(
     exports: Exports, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in a container whose home is read-only."""
+    """As in a container whose home is read-only. A signal leaves no folder."""
     (tmp_path / "file").touch()
     monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "file" / "cache"))
+    folders: list[Path] = []
+
+    def export(weights: Weights, out: Path, int8: str | None = None) -> None:
+        assert out in unfinished
+        folders.append(out)
+        exports(weights, out, int8)
+
+    monkeypatch.setattr(cache, "export", export)
     for count in (1, 2):
         contents, said = cached()
         assert set(contents) == {RANGE_NET, UNET}
         assert "expected a cache to write to" in said
         assert exports.count == count
+        assert not folders[-1].exists()
 
 
 def test_new_folders_and_files_of_the_cache_are_private(exports: Exports) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import shlex
 import shutil
@@ -254,6 +255,32 @@ def test_the_graphs_say_nothing_of_the_machine(exported: Exports) -> None:
         data = path.read_bytes()
         for word in (str(PROJECT), sys.prefix, "site-packages"):
             assert word.encode() not in data, path.name
+
+
+SESSION = """
+import onnx
+from onnx import TensorProto, helper
+
+values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in "xy"]
+node = helper.make_node("Relu", ["x"], ["y"])
+graph = helper.make_graph([node], "g", values[:1], values[1:])
+opset = helper.make_opsetid("", 18)
+model = helper.make_model(graph, opset_imports=[opset], ir_version=8)
+
+from pathlib import Path
+from amvnet.onnx_runner import open_session
+open_session(Path("a"), model.SerializeToString(), ["CPUExecutionProvider"])
+"""
+
+
+def test_onnx_runtime_reports_nothing_and_writes_nothing(tmp_path: Path) -> None:
+    """It keeps what it would report in the user's cache, with an identifier of the machine."""
+    environment = {name: text for name, text in os.environ.items() if name != "CI"}
+    environment.pop("ORT_DISABLE_TELEMETRY", None)
+    for name in ("HOME", "TMPDIR", "XDG_CACHE_HOME"):
+        environment[name] = str(tmp_path)
+    subprocess.run([sys.executable, "-c", SESSION], env=environment, check=True, timeout=60)
+    assert not list(tmp_path.iterdir())
 
 
 # ---- the runner

@@ -421,6 +421,12 @@ class Reluctant(Mortal):
         raise InputError("expected a library on this machine, found none; install it")
 
 
+def test_a_ray_that_starts_here_reports_nothing_of_its_use() -> None:
+    from ray._private.usage import usage_lib
+
+    assert not usage_lib.usage_stats_enabled()
+
+
 def test_workers_that_cannot_start_are_one_line(
     mortal: None, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

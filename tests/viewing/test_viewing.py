@@ -22,7 +22,9 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.palette import WRONG, class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.errors import InputError
 from amvnet.evaluation.scoring import labels_by_method
+from amvnet.files import unfinished
 from amvnet.viewing import page as pages
 from amvnet.viewing.shown_scans import RIGHT, ShownScan, shown_scan
 from amvnet.weights.file import save
@@ -476,6 +478,20 @@ def test_without_a_file_a_temporary_page_opens_in_the_browser(
     (page,) = tmp_path.glob("*/scan.html")
     assert opened == [page.as_uri()]
     assert len(scan_names(read_page(page))) == 5
+
+
+def test_a_temporary_page_that_is_not_written_leaves_no_folder(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: object) -> None:
+        assert set(tmp_path.iterdir()) <= unfinished  # a signal removes it
+        raise InputError("expected a, found b; c")
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(pages, "pack", fail)
+    code, _ = run_cli("view", world / "data")
+    assert code == 2
+    assert not list(tmp_path.iterdir())
 
 
 # ---- what a browser draws

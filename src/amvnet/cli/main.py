@@ -44,6 +44,8 @@ CONTINUED_WHEN_REPEATED = (
 WITH_PROCESSES = ("train", "evaluate", "ablate")  # commands whose work several processes can share
 WITH_RECIPE = ("train", "ablate")  # commands whose options are also the values of a recipe
 
+TRACKER_FILTER = "ignore:resource_tracker"  # a filter of warnings, as Python's option -W takes it
+
 # Exit codes.
 DONE = 0
 FAILED = 1
@@ -182,6 +184,10 @@ def _suppress_library_warnings() -> None:
     """Suppress warnings of libraries, which are meant for developers."""
     warnings.filterwarnings("ignore", module="lightning")
     warnings.filterwarnings("ignore", module="torch")
+    # Python's process that tracks semaphores warns if a command was stopped at once.
+    filters = os.environ.get("PYTHONWARNINGS", "").split(",")
+    if TRACKER_FILTER not in filters:
+        os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [*filters, TRACKER_FILTER]))
 
 
 if __name__ == "__main__":

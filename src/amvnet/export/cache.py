@@ -8,7 +8,7 @@ import uuid
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
+from tempfile import TemporaryFile
 
 import torch
 
@@ -23,7 +23,7 @@ from amvnet.cache import (
 from amvnet.engines.onnx import RANGE_NET, UNET, ExportedNetworks
 from amvnet.errors import InputError
 from amvnet.export.onnx import OPSET, check_libraries, export
-from amvnet.files import unfinished
+from amvnet.files import temporary_folder, unfinished
 from amvnet.models.methods import widest_method
 from amvnet.onnx_runner import read_description, read_graph
 from amvnet.progress import Reporter, report_nothing
@@ -69,9 +69,9 @@ def cached_networks(
             f"{problem}; the networks are {exported} for this run alone; correct its owner and "
             f"mode, or set {CACHE} to a folder of yours"
         )
-        with TemporaryDirectory() as temporary:
+        with temporary_folder() as temporary:
             export(weights, temporary, int8=int8)
-            return ExportedNetworks(_read(Path(temporary), weights))
+            return ExportedNetworks(_read(temporary, weights))
 
     found = "" if not folder.exists() else ", because files in the cache were missing or changed"
     report(f"the networks are {exported}{found}, once for these weights, and kept in {folder}")

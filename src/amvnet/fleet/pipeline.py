@@ -37,6 +37,7 @@ from amvnet.sensors.measure import MEASURED_SCANS
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
 # Workers get the niceness of `predict`; Ray's default is 15.
 os.environ.setdefault("RAY_worker_niceness", "0")
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a Ray that starts here reports nothing
 import ray
 import ray.data
 from ray.exceptions import RayError

@@ -11,7 +11,8 @@ import re
 import tempfile
 import webbrowser
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.evaluation.metrics import OVERALL, Evaluation
-from amvnet.files import atomic_write
+from amvnet.files import atomic_write, unfinished
 from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
 from amvnet.outputs import Signature, check_outputs
@@ -97,17 +98,32 @@ def show(result: Segmentation, path: Path | str | None = None, open_browser: boo
         check_outputs({Path(path): PAGE}, [origin.path], overwrite=True)
     title = Path(origin.scan.name).name or "scan"
     shown = shown_scan(result, origin)
-    page = Path(path or temporary_page())
-    write_page(page, [shown], origin.taxonomy, title)
+    with place_for_page(path) as page:
+        write_page(page, [shown], origin.taxonomy, title)
     if open_browser:
         open_page(page)
 
     return page
 
 
-def temporary_page() -> Path:
-    """Return the path of a page in a new temporary folder."""
-    return Path(tempfile.mkdtemp(prefix="amvnet-")) / "scan.html"
+@contextmanager
+def place_for_page(path: Path | str | None) -> Iterator[Path]:
+    """Yield the path, or else a path in a new temporary folder.
+
+    The temporary folder stays if the page is written in the block.
+    """
+    if path is not None:
+        yield Path(path)
+        return
+
+    folder = Path(tempfile.mkdtemp(prefix="amvnet-"))
+    unfinished.add(folder)
+    try:
+        yield folder / "scan.html"
+    finally:
+        unfinished.discard(folder)
+        with suppress(OSError):  # the page is in the folder
+            folder.rmdir()
 
 
 def open_page(path: Path) -> None:

@@ -48,7 +48,7 @@ def view(
     from amvnet.inference.reading import normaliser_for
     from amvnet.outputs import check_outputs
     from amvnet.sensors.normalise import Normaliser
-    from amvnet.viewing.page import PAGE, open_page, temporary_page, write_page
+    from amvnet.viewing.page import PAGE, open_page, place_for_page, write_page
     from amvnet.viewing.shown_scans import check_labels, show_scans
     from amvnet.weights.file import load
 
@@ -81,8 +81,7 @@ def view(
     if loaded is not None:
         segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
     chosen = evenly_spaced(listed, scans)
-    page = html or temporary_page()
-    with progress("looking") as step:
+    with place_for_page(html) as page, progress("looking") as step:
         shown = show_scans(chosen, classes, segmenter, labels, progress=step)
         write_page(page, shown, classes, _title(inputs, weights))
     report(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")

@@ -177,9 +177,10 @@ class OwnScans(Dataset):
         """The scans by name: the path from `root`, without the ending."""
         pattern = self.description.scans
         try:
-            matches = sorted(self.root.glob(pattern))
             if ANY_FOLDERS in Path(pattern).parts:  # Python's own does not follow links
                 matches = matching(Path(glob.escape(str(self.root))) / pattern)
+            else:
+                matches = sorted(self.root.glob(pattern))
         except (ValueError, NotImplementedError, IndexError, OSError) as error:
             reason = "" if isinstance(error, IndexError) else f" ({reason_of(error)[:160]})"
             raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -211,17 +211,27 @@ def _matches(pattern: str) -> list[Path]:
 def matching(pattern: Path) -> list[Path]:
     """Return the paths that match a pattern, sorted; `**` also follows links to folders."""
     parts = pattern.parts
-    if ANY_FOLDERS not in parts:
-        return sorted(map(Path, glob.glob(str(pattern))))
+    has_several = parts.count(ANY_FOLDERS) > 1
+    folders = {Path()}
+    while ANY_FOLDERS in parts:
+        index = parts.index(ANY_FOLDERS)
+        tops = _matching_in(folders, parts[:index])
+        folders = {folder for top in tops for folder in _folders_below(top)}
+        parts = parts[index + 1 :] or ("*",)
+        if has_several:  # many ways may lead to a folder: take the shortest one
+            ways = sorted(folders, key=lambda way: (len(way.parts), way), reverse=True)
+            folders = set({way.resolve(): way for way in ways}.values())
+    return sorted(_matching_in(folders, parts))
 
-    index = parts.index(ANY_FOLDERS)
+
+def _matching_in(folders: Iterable[Path], parts: Sequence[str]) -> set[Path]:
+    """Return the paths in some folders that match the parts of a pattern, without `**`."""
     paths: set[Path] = set()
-    for top in matching(Path(*parts[:index])) if index else [Path()]:
-        for folder in _folders_below(top):
-            # The folder is a name, not a pattern, whatever characters it has.
-            rest = Path(*parts[index + 1 :]) if parts[index + 1 :] else Path("*")
-            paths.update(matching(Path(glob.escape(str(folder))) / rest))
-    return sorted(paths)
+    for folder in folders:
+        # The folder is a name, not a pattern, whatever characters it has.
+        pattern = Path(glob.escape(str(folder))).joinpath(*parts)
+        paths.update(map(Path, glob.glob(str(pattern))))
+    return paths
 
 
 def _folders_below(top: Path) -> list[Path]:

@@ -36,7 +36,7 @@ SEPARATORS = (";", ",", None)
 # The names of coordinates in other programs, such as "Points:0" in ParaView and VeloView.
 POINTS_NAME = re.compile(r"points?(?:_m_xyz)?[:_](\d)")
 FIRST_RETURN = re.compile(r"([xyz])1")  # a coordinate of the first return: ouster-cli has "X1 (m)"
-UNITS = re.compile(r"\s*[\[(].*$")  # a unit after a name, as in "x [m]"
+UNITS = re.compile(r"[\[(].*$")  # a unit after a name, as in "x [m]"
 EXPECTED = "lines of numbers"
 ADVICE = "write a line x y z intensity per point"
 
@@ -176,7 +176,7 @@ def _uncomment(line: str) -> str:
 
 def _clean_name(name: str) -> str:
     """Return the name of a column without quotes and units, such as "x" for "Points:0"."""
-    bare = UNITS.sub("", name.strip().strip("\"'").strip()).lower()
+    bare = UNITS.sub("", name.strip().strip("\"'").strip()).rstrip().lower()
     first = FIRST_RETURN.fullmatch(bare)
     if first:
         return first[1]
