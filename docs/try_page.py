@@ -8,6 +8,7 @@ weights, a sample scan, the viewer, and ONNX Runtime Web, which `npm ci --prefix
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import shutil
@@ -26,14 +27,15 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "docs" / "try"
 PATTERNS = ("*.html", "*.css", "*.js", "*/*.js")  # the files of SOURCE; node_modules lies deeper
 RUNTIME = SOURCE / "node_modules" / "onnxruntime-web" / "dist"
-RUNTIME_FILES = (  # three files for the CPU, three for GPUs
+# ONNX Runtime Web for the CPU and, with jspi, for GPUs.
+RUNTIME_SCRIPTS = (
     "ort.wasm.min.mjs",
     "ort-wasm-simd-threaded.mjs",
-    "ort-wasm-simd-threaded.wasm",
     "ort.jspi.min.mjs",
     "ort-wasm-simd-threaded.jspi.mjs",
-    "ort-wasm-simd-threaded.jspi.wasm",
 )
+# The page loads these compressed, because few hosts compress them; they shrink to a quarter.
+RUNTIME_BINARIES = ("ort-wasm-simd-threaded.wasm", "ort-wasm-simd-threaded.jspi.wasm")
 WITHOUT_RUNTIME = (
     f"{RUNTIME}: expected ONNX Runtime Web, found none: the page try/ is left out; install Node.js "
     "with npm, and run make docs again"
@@ -65,8 +67,11 @@ def build(out: Path) -> None:
     for pattern in PATTERNS:
         for path in SOURCE.glob(pattern):
             copy(path, out / path.relative_to(SOURCE))
-    for name in RUNTIME_FILES:
+    for name in RUNTIME_SCRIPTS:
         copy(RUNTIME / name, out / "ort" / name)
+    for name in RUNTIME_BINARIES:
+        packed = gzip.compress((RUNTIME / name).read_bytes(), mtime=0)
+        (out / "ort" / f"{name}.gz").write_bytes(packed)
 
     (out / "viewer.html").write_text(viewer(), encoding="utf-8")
     (out / "models.json").write_text(json.dumps(MODELS, indent=1) + "\n", encoding="utf-8")

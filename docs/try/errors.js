@@ -2,7 +2,7 @@
 export class InputError extends Error {}
 
 /** Return text from a file for an error message: in quotes, in one line, and short. */
-export function shown(text, longest = 100) {
+export function quoted(text, longest = 100) {
   return `'${[...text].slice(0, longest).map((letter) => (/[ -~]/.test(letter) ? letter : "?")).join("")}'`;
 }
 

@@ -2,46 +2,41 @@
 
 import { counted } from "./errors.js";
 import { partsOf, rawIds, save } from "./download.js";
+import { fetched, fetchedJson } from "./files.js";
 
 const byId = (id) => document.getElementById(id);
 const worker = new Worker(`worker.js${location.search}`, { type: "module" });
 let models = [], file = null, asked = 0, started = 0, result = null;
 
-async function fetched(path) {
-  const response = await fetch(path);
-  if (!response.ok) throw new Error(`${path}: expected a file of this page, found none; build the page again`);
-  return response;
-}
-
 /** Ask the worker to label the file, or only to show it. Answers to earlier requests are then ignored. */
 function ask(isPreview = false) {
-  if (!file) return;
+  if (!file || !models.length) return;
   result = null;
   asked++;
   started = performance.now();
   byId("steps").replaceChildren();
   byId("assumed").textContent = "";
-  byId("problem").hidden = byId("downloads").hidden = true;
-  setState(isPreview ? "reading" : "labelling", isPreview ? "" : `${file.name} …`);
-  worker.postMessage({ id: asked, file, folder: chosen().folder, isPreview });
-}
-
-function chosen() {
-  return models[byId("weights").selectedIndex];
+  for (const id of ["problem", "options", "downloads"]) byId(id).hidden = true;
+  setState(isPreview ? "reading" : "labelling", `${file.name} …`);
+  worker.postMessage({ id: asked, file, folder: models[byId("weights").selectedIndex].folder, isPreview });
 }
 
 /** Show the state of the work. Programs that read the page, such as tests, find it in `data-state`. */
 function setState(state, text) {
   document.documentElement.dataset.state = state;
   byId("state").textContent = text;
-  byId("label").disabled = state === "labelling";
+  byId("label").disabled = !file || state === "labelling";
 }
 
 const ON_MESSAGE = {
-  loading: ({ share }) => setState("labelling", `loading the networks, ${Math.round(100 * share)} %`),
-  step: ({ title, seconds }) => addStep(title, seconds),
+  began: ({ work }) => (byId("state").textContent = `${work} …`),
+  step: ({ title, seconds }) => {
+    const row = byId("steps").insertRow();
+    for (const text of [title, `${seconds.toFixed(2)} s`]) row.insertCell().textContent = text;
+  },
   shown: (shown) => {
     byId("assumed").textContent = `${shown.scan.name}: ${shown.text}`;
+    byId("options").hidden = !shown.text.includes("--");
     show(shown);
     if (document.documentElement.dataset.state === "reading") setState("shown", "");
   },
@@ -54,12 +49,6 @@ const ON_MESSAGE = {
   },
   failed: ({ text }) => fail(text),
 };
-
-function addStep(title, seconds) {
-  const row = byId("steps").insertRow();
-  row.insertCell().textContent = title;
-  row.insertCell().textContent = `${seconds.toFixed(2)} s`;
-}
 
 function fail(text) {
   byId("problem").textContent = text;
@@ -87,13 +76,14 @@ function takeDrops(target) {
   target.addEventListener("drop", (event) => {
     event.preventDefault();
     document.body.classList.remove("dropping");
-    open(event.dataTransfer.files[0]);
+    open(event.dataTransfer.files);
   });
 }
 
-function open(dropped) {
-  if (!dropped) return;
-  file = dropped;
+function open(files) {
+  if (files.length > 1) return fail(`expected one scan, found ${files.length} files; drop one of them`);
+  if (!files.length) return;  // a text was dropped, or no file was chosen
+  [file] = files;
   ask();
 }
 
@@ -101,7 +91,10 @@ async function start() {
   worker.onmessage = ({ data }) => data.id === asked && ON_MESSAGE[data.kind](data);
   worker.onerror = () => fail("expected a browser of 2023 or later, found one that cannot run this page; use another");
   takeDrops(window);
-  byId("file").onchange = (event) => open(event.target.files[0]);
+  byId("file").onchange = ({ target }) => {
+    open(target.files);
+    target.value = "";  // so that the same file can be chosen again
+  };
   byId("label").onclick = () => ask();
   byId("weights").onchange = () => ask();
   for (const kind of ["label", "npy"]) {
@@ -111,11 +104,15 @@ async function start() {
     };
   }
 
-  models = await (await fetched("models.json")).json();
+  setState("reading", "loading a sample scan …");
+  models = await fetchedJson("models.json", "mend it, or build the page again");
   byId("weights").replaceChildren(...models.map(({ title }) => new Option(title)));
   const { sample } = models[0];
+  if (file) return ask();  // a scan was dropped in the meantime
   if (!sample) return setState("empty", "");
-  file = new File([await (await fetched(sample)).blob()], sample.split("/").at(-1));
+  const contents = await (await fetched(sample)).blob();
+  if (file) return;
+  file = new File([contents], sample.split("/").at(-1));
   ask(true);
 }
 

@@ -18,7 +18,10 @@ export function shownScan(name, { points, count }, segmentation, description) {
   const near = Uint32Array.from({ length: points.length / 4 }, (_, i) => i).filter(isNear);
   const stride = Math.max(1, Math.ceil(near.length / MAX_POINTS)), indices = near.filter((_, place) => place % stride === 0);
 
-  const scan = { name, index: 0, count: indices.length, note: noteOf(count - near.length, stride), ...quantised(points, indices) };
+  const leftOut = count - near.length, notes = [];
+  if (leftOut) notes.push(`${counted(leftOut)} without a position or beyond ${REACH} m`);
+  if (stride > 1) notes.push(`one in ${stride} of the scan`);
+  const scan = { name, index: 0, count: indices.length, note: notes.join("; "), ...quantised(points, indices) };
   const byte = (value) => Math.round(Math.min(Math.max(value, 0), 1) * 255);
   const plane = (valueOf) => Uint8Array.from(indices, valueOf);
   const { scores = {}, labels = {}, similarity, uncertain } = segmentation ?? {};
@@ -54,11 +57,6 @@ function bestTwo(scores, indices, k) {
     best.secondShare[place] = percent(second);
   });
   return best;
-}
-
-function noteOf(leftOut, stride) {
-  const missing = leftOut ? `${counted(leftOut)} without a position or beyond ${REACH} m` : "";
-  return [missing, stride > 1 ? `one in ${stride} of the scan` : ""].filter(Boolean).join("; ");
 }
 
 /** Return {center, step, positions}: the points as int16 multiples of a step from the centre. */

@@ -1,10 +1,11 @@
 // Read and segment scans in a worker, so that the page stays responsive.
 //
 // The worker takes {id, file, folder, isPreview}: a scan file, and the folder of the weights. It sends messages with
-// the same id: {kind: "loading", share}, {kind: "step", title, seconds}, {kind: "shown", ...},
-// {kind: "labelled", ...} and {kind: "failed", text}.
+// the same id: {kind: "began", work}, {kind: "step", title, seconds}, {kind: "shown", ...}, {kind: "labelled", ...} and
+// {kind: "failed", text}. A newer request ends the work on an older one after its step.
 
 import { InputError } from "./errors.js";
+import { unpacked } from "./files.js";
 import { segment } from "./method/amvnet.js";
 import { Networks, readDescription } from "./method/networks.js";
 import { readCloud } from "./reading/read.js";
@@ -13,9 +14,11 @@ import { shownScan } from "./shown.js";
 
 const LARGEST_FILE = 200;  // the largest file that is read, megabytes
 const MAX_THREADS = 8;
-let runtime = null, loaded = { folder: null, networks: null }, last = Promise.resolve();
+let runtime = null, networks = null;
+let newest = 0, last = Promise.resolve();  // the id of the newest request, and the work on all requests
 
 addEventListener("message", ({ data }) => {
+  newest = data.id;
   last = last.then(() => label(data)).catch((error) => {
     if (!(error instanceof InputError)) console.warn(error);
     const text = error instanceof InputError ? error.message : `This is a fault of the page: ${error.message}`;
@@ -26,6 +29,9 @@ addEventListener("message", ({ data }) => {
 async function label({ id, file, folder, isPreview }) {
   const send = (kind, content) => postMessage({ id, kind, ...content });
   const step = async (title, work) => {
+    await new Promise((resolve) => setTimeout(resolve));  // newer requests arrive now
+    if (id !== newest) throw new InputError("a newer request");
+    send("began", { work: title });
     const start = performance.now(), result = await work();
     send("step", { title, seconds: (performance.now() - start) / 1000 });
     return result;
@@ -33,16 +39,17 @@ async function label({ id, file, folder, isPreview }) {
 
   const description = await readDescription(folder);
   const cloud = await step("read", async () => readCloud(await bytesOf(file), file.name));
-  const scan = await step("normalise", () => normalise(cloud, expectationOf(description)));
+  const { range_view: view, normalise: { sensor, intensity, as_is: isAsIs } } = description;
+  const scan = await step("normalise", () => normalise(cloud, { view, sensor, intensity, isAsIs }));
   send("shown", { text: scan.text, ...shownScan(file.name, scan, null, description) });
   if (isPreview) return;
 
-  runtime ??= await start(new URLSearchParams(location.search).get("device"));
-  const run = async () => segment(await load(folder, description, (share) => send("loading", { share })), scan, step);
+  runtime ??= await step("load ONNX Runtime", () => start(new URLSearchParams(location.search).get("device")));
+  const run = async () => segment(await load(folder, description, step), scan, step);
   const segmentation = await run().catch(async (error) => {
     if (runtime.device === "wasm" || error instanceof InputError) throw error;
     runtime = await start("wasm");  // the GPU has failed
-    loaded = { folder: null, networks: null };
+    networks = null;
     return run();
   });
   const shown = shownScan(file.name, scan, segmentation, description);
@@ -52,18 +59,16 @@ async function label({ id, file, folder, isPreview }) {
 
 async function bytesOf(file) {
   if (file.size > LARGEST_FILE * 1e6) {
-    const size = (file.size / 1e6).toFixed(0);
     throw new InputError(
-      `${file.name}: expected a file of at most ${LARGEST_FILE} MB, found ${size} MB; split it into scans, ` +
-      "or label it with amvnet predict",
+      `${file.name}: expected a file of at most ${LARGEST_FILE} MB, found ${(file.size / 1e6).toFixed(0)} MB; ` +
+      "split it into scans, or label it with amvnet predict",
     );
   }
-  return new Uint8Array(await file.arrayBuffer());
-}
-
-/** Return a description of the scans that the weights know, for `normalise`. */
-function expectationOf({ range_view: view, normalise: { sensor, intensity, as_is: isAsIs } }) {
-  return { view, sensor, intensity, isAsIs };
+  try {
+    return new Uint8Array(await file.arrayBuffer());
+  } catch {
+    throw new InputError(`${file.name}: expected a file that can be read, found a folder or a changed file; drop a scan again`);
+  }
 }
 
 /** Load ONNX Runtime, for the GPU if `wanted` is "webgpu" and the browser offers one. Return {ort, device, text}. */
@@ -73,17 +78,16 @@ async function start(wanted) {
   const ort = await import(`./ort/ort.${adapter ? "jspi" : "wasm"}.min.mjs`);
   const threads = crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, MAX_THREADS) : 1;
   ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
+  ort.env.wasm.wasmBinary = await unpacked(`ort/ort-wasm-simd-threaded${adapter ? ".jspi" : ""}.wasm.gz`);
   ort.env.wasm.numThreads = threads;
   const many = threads > 1 ? `${threads} threads` : "one thread";
   return { ort, device, text: adapter ? "on the GPU" : `with ${many}` };
 }
 
 /** Return the networks of a folder; drop the networks of any other folder. */
-async function load(folder, description, progress) {
-  if (loaded.folder === folder) return loaded.networks;
-  await loaded.networks?.release();
-  loaded = { folder: null, networks: null };
-  const networks = await Networks.load(runtime.ort, folder, description, runtime.device, progress);
-  loaded = { folder, networks };
-  return networks;
+async function load(folder, description, step) {
+  if (networks?.folder === folder) return networks;
+  for (const session of Object.values(networks?.sessions ?? {})) await session.release();
+  networks = null;
+  return (networks = await step("load the networks", () => Networks.load(runtime, folder, description)));
 }

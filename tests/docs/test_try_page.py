@@ -16,6 +16,7 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -23,14 +24,16 @@ import pytest
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
+from amvnet.export.onnx import export
 from amvnet.inference.reading import expectation_of
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.sensors.normalise import Normaliser
-from amvnet.weights.file import load
+from amvnet.weights.file import load, save
 
 from fixtures.browser_pages import CHROMIUM, FLAGS
 from fixtures.scan_writers import write_pcd
 from fixtures.sensors import LASERS, place
+from fixtures.tiny import fresh_weights
 
 ROOT = Path(__file__).parents[2]
 DRIVER = ROOT / "tests" / "fixtures" / "try_page.mjs"
@@ -39,11 +42,19 @@ NODE = shutil.which("node")
 TIMEOUT = 1500  # seconds: five scans on a machine that does much else
 MEGABYTE = 1_000_000
 AGREEMENT = 0.999  # least share of the points with the labels of `onnx_runner.py`
-# With these, a browser may run threads.
+OWN = "mine"  # the folder of own weights beside the page
+# With these headers, a browser may run threads.
 ISOLATION = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Embedder-Policy": "require-corp",
 }
+
+# With these options, Chromium offers WebGPU without a GPU.
+SOFTWARE_GPU = [
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan",
+]
 
 MISSING = [
     what
@@ -106,7 +117,7 @@ def served(folder: Path, headers: dict[str, str]) -> Iterator[Site]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the page, and return the folder around it."""
+    """Build the page with tiny weights beside the built-in ones; return the folder around it."""
     spec = importlib.util.spec_from_file_location("try_page", ROOT / "docs" / "try_page.py")
     assert spec is not None
     assert spec.loader is not None
@@ -115,16 +126,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     site = tmp_path_factory.mktemp("site")
     module.build(site / "try")
+
+    # As docs/deployment.md says.
+    save(fresh_weights(), own_weights(site))
+    export(own_weights(site), site / "try" / OWN)
+    models = site / "try" / "models.json"
+    listed = [*json.loads(models.read_text()), {"folder": OWN, "title": "Our classes"}]
+    models.write_text(json.dumps(listed))
     return site
 
 
-def drive(site: Site, cases: list[dict[str, Any]], downloads: Path) -> dict[str, Any]:
+def own_weights(site: Path) -> Path:
+    return site / f"{OWN}.safetensors"
+
+
+def drive(
+    site: Site, cases: list[dict[str, Any]], downloads: Path, on_gpu: bool = False
+) -> dict[str, Any]:
     """Open the page in Chromium and label scans; return the report of the driver."""
+    flags = [flag for flag in FLAGS if "=" not in flag or "gl" in flag]
+    if on_gpu:
+        flags = [flag for flag in flags if flag != "--disable-gpu"] + SOFTWARE_GPU
     job = {
         "playwright": str(PLAYWRIGHT),
         "chromium": CHROMIUM,
-        "flags": [flag for flag in FLAGS if "=" not in flag or "gl" in flag],
-        "url": f"{site.url}index.html",
+        "flags": flags,
+        "url": f"{site.url}index.html{'?device=webgpu' if on_gpu else ''}",
         "cases": cases,
     }
     command = [str(NODE), str(DRIVER), str(downloads), json.dumps(job)]
@@ -134,7 +161,7 @@ def drive(site: Site, cases: list[dict[str, Any]], downloads: Path) -> dict[str,
 
 
 def scan_files(folder: Path) -> dict[str, Path]:
-    """Write a scan as of KITTI, one as of nuScenes, one of PCL, and a broken file."""
+    """Write a scan as of KITTI, one as of nuScenes, one of PCL, a small one and a broken file."""
     points, _ = place(np.linspace(-23.9, 3, 64), 2.2, steps=500)
     points[::40, :3] = 0  # lost returns
     kitti = folder / "kitti.bin"
@@ -147,9 +174,12 @@ def scan_files(folder: Path) -> dict[str, Path]:
 
     points, _ = place(LASERS["os1-64"], 1.9, steps=500)
     pcd = write_pcd(folder / "cloud.pcd", points, "binary_compressed")
+    points, _ = place(np.linspace(-23.9, 3, 16), 1.73, steps=250)
+    own = folder / "own.bin"
+    own.write_bytes(points.astype(np.float32).tobytes())
     broken = folder / "broken.pcd"
     broken.write_bytes(pcd.read_bytes()[:-500])
-    return {"kitti": kitti, "nuscenes": nuscenes, "pcd": pcd, "broken": broken}
+    return {"kitti": kitti, "nuscenes": nuscenes, "pcd": pcd, "own": own, "broken": broken}
 
 
 @dataclass(frozen=True)
@@ -179,15 +209,28 @@ def session(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
         {"file": str(files["kitti"]), "model": 0},
         {"file": str(files["nuscenes"]), "model": 1},
         {"file": str(files["pcd"]), "model": 0},
+        {"file": str(files["own"]), "model": 2},
         {"file": str(files["broken"]), "model": 0},
+        {"drop": ["a.bin", "b.bin"], "model": 0},
     ]
     with served(folder, ISOLATION) as site:
         report = drive(site, cases, scans)
-    results = dict(zip(files, report["results"], strict=True))
+    results = dict(zip([*files, "several"], report["results"], strict=True))
     return Session(report, results, files, site)
 
 
-def reference(path: Path, weights: str, graphs: Path) -> np.ndarray:
+@pytest.fixture(scope="module")
+def plain(
+    folder: Path, session: Session, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
+    """Label a scan in a browser that may not use threads, just after another one was opened."""
+    older = {"file": str(session.files["kitti"]), "model": 0}
+    newer = {"file": str(session.files["nuscenes"]), "model": 1}
+    with served(folder, {}) as site:
+        return drive(site, [newer | {"after": older}], tmp_path_factory.mktemp("plain"))
+
+
+def reference(path: Path, weights: str | Path, graphs: Path) -> np.ndarray:
     """Return the raw ids by `onnx_runner.py` of a scan that is normalised as in `predict`."""
     loaded = load(weights)
     normaliser = Normaliser(expectation_of(loaded))
@@ -210,13 +253,24 @@ WEIGHTS = {
 def test_a_scan_gets_the_labels_of_the_onnx_runner(
     name: str, session: Session, folder: Path
 ) -> None:
-    result = session.results[name]
+    weights = WEIGHTS[name]
+    expected = reference(session.files[name], weights, folder / "try" / weights)
+    check_labels(session.results[name], expected)
+    assert len(np.unique(expected)) > 3
+
+
+def check_labels(result: dict[str, Any], expected: np.ndarray) -> None:
     assert result["state"] == "labelled", result["problem"]
     ids = np.fromfile(result["label"], np.uint32)
-    expected = reference(session.files[name], WEIGHTS[name], folder / "try" / WEIGHTS[name])
     assert len(ids) == len(expected)
     assert (ids == expected).mean() >= AGREEMENT
-    assert len(np.unique(expected)) > 3
+
+
+def test_own_weights_beside_the_page_label_as_the_onnx_runner(
+    session: Session, folder: Path
+) -> None:
+    expected = reference(session.files["own"], own_weights(folder), folder / "try" / OWN)
+    check_labels(session.results["own"], expected)
 
 
 def test_both_downloads_have_the_same_ids(session: Session) -> None:
@@ -239,6 +293,12 @@ def test_a_broken_file_gives_its_line(session: Session) -> None:
     assert result["state"] == "failed"
     assert result["problem"].startswith("broken.pcd: expected at least ")
     assert result["problem"].endswith("the file is truncated, copy it again")
+
+
+def test_only_one_of_several_dropped_files_can_be_labelled(session: Session) -> None:
+    result = session.results["several"]
+    assert result["state"] == "failed"
+    assert result["problem"] == "expected one scan, found 2 files; drop one of them"
 
 
 def test_steps_have_times_and_the_line_says_what_was_assumed(session: Session) -> None:
@@ -264,24 +324,39 @@ def test_the_console_has_no_errors_and_no_warnings(session: Session) -> None:
 
 
 def test_the_page_is_small(session: Session) -> None:
-    sizes = [size for _, size in session.site.sent]
-    first = sum(sizes[: session.report["first"]["requests"]])
-    assert first < 3 * MEGABYTE
-    assert sum(dict(session.site.sent).values()) < 40 * MEGABYTE  # with both weights
+    sizes = dict(session.site.sent)
+    paths = {urlsplit(url).path for url in session.report["first"]["requests"]}
+    first = [sizes[path] for path in paths & sizes.keys()]
+    assert len(first) > 20
+    assert sum(first) < 3 * MEGABYTE
+    files = (session.site.folder / "try").rglob("*")
+    assert sum(path.stat().st_size for path in files) < 40 * MEGABYTE
     assert session.report["memory"] < 1000 * MEGABYTE
 
 
 def test_without_isolation_one_thread_labels_a_scan(
-    folder: Path, session: Session, tmp_path: Path
+    plain: dict[str, Any], session: Session
 ) -> None:
-    with served(folder, {}) as site:
-        report = drive(site, [{"file": str(session.files["nuscenes"]), "model": 1}], tmp_path)
-    (result,) = report["results"]
-    assert report["isolated"] is False
+    (result,) = plain["results"]
+    assert plain["isolated"] is False
     assert "one thread" in result["line"]
-    ids = np.fromfile(result["label"], np.uint32)
-    by_threads = np.fromfile(session.results["nuscenes"]["label"], np.uint32)
-    assert (ids == by_threads).mean() >= AGREEMENT
+    check_labels(result, np.fromfile(session.results["nuscenes"]["label"], np.uint32))
+
+
+def test_a_newer_scan_ends_the_work_on_an_older_one(plain: dict[str, Any]) -> None:
+    loaded = [url for url in plain["requests"] if url.endswith(".onnx")]
+    assert len(loaded) == 6
+    assert all(WEIGHTS["nuscenes"] in url for url in loaded)  # the older scan needs other weights
+
+
+@pytest.mark.slow
+def test_webgpu_gives_the_labels_of_the_cpu(folder: Path, session: Session, tmp_path: Path) -> None:
+    with served(folder, ISOLATION) as site:
+        case = {"file": str(session.files["own"]), "model": 2}
+        (result,) = drive(site, [case], tmp_path, on_gpu=True)["results"]
+    if "on the GPU" not in result["line"]:
+        pytest.skip("Chromium offers no WebGPU in software here")
+    check_labels(result, np.fromfile(session.results["own"]["label"], np.uint32))
 
 
 def test_the_page_has_less_than_1500_lines_of_code() -> None:

@@ -7,35 +7,20 @@ export class KdTree {
   constructor(points) {
     this.points = points;
     this.ids = Uint32Array.from({ length: points.length / 4 }, (_, i) => i);
-    this.axes = new Uint8Array(this.ids.length);  // the axis that divides each branch, at the place of its middle point
-    this.divide(0, this.ids.length);
+    this.divide(0, this.ids.length, 0);
   }
 
-  /** Divide the ids from start to end into halves, along the axis of their largest extent. */
-  divide(start, end) {
+  /** Divide the ids from start to end into halves along an axis: x and y in turns, because scans are wide and low. */
+  divide(start, end, axis) {
     if (end - start <= LEAF) return;
-    const middle = (start + end) >> 1, axis = this.widestAxis(start, end);
+    const middle = (start + end) >> 1, next = 1 - axis;
     this.select(middle, start, end - 1, axis);
-    this.axes[middle] = axis;
-    this.divide(start, middle);
-    this.divide(middle + 1, end);
+    this.divide(start, middle, next);
+    this.divide(middle + 1, end, next);
   }
 
   at(place, axis) {
     return this.points[4 * this.ids[place] + axis];
-  }
-
-  widestAxis(start, end) {
-    const extents = [0, 1, 2].map((axis) => {
-      let low = Infinity, high = -Infinity;
-      for (let place = start; place < end; place++) {
-        const value = this.at(place, axis);
-        if (value < low) low = value;
-        if (value > high) high = value;
-      }
-      return high - low;
-    });
-    return extents.indexOf(Math.max(...extents));
   }
 
   /** Move ids so that, along the axis, no point before `middle` is larger and none after it is smaller (quickselect). */
@@ -74,19 +59,19 @@ export class KdTree {
       squares[rank] = square;
       ids[rank] = id;
     };
-    const visit = (start, end) => {
+    const visit = (start, end, axis) => {
       if (end - start <= LEAF) {
         for (let place = start; place < end; place++) compare(place);
         return;
       }
-      const middle = (start + end) >> 1, axis = this.axes[middle], off = query[axis] - this.at(middle, axis);
+      const middle = (start + end) >> 1, next = 1 - axis, off = query[axis] - this.at(middle, axis);
       const halves = [[start, middle], [middle + 1, end]];
       if (off > 0) halves.reverse();
-      visit(...halves[0]);
+      visit(...halves[0], next);
       compare(middle);
-      if (off * off < squares[m - 1]) visit(...halves[1]);
+      if (off * off < squares[m - 1]) visit(...halves[1], next);
     };
-    visit(0, this.ids.length);
+    visit(0, this.ids.length, 0);
     return ids;
   }
 }

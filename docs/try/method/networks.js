@@ -1,10 +1,11 @@
 // Run the networks, which are graphs of `amvnet export`, in ONNX Runtime Web.
 
 import { InputError } from "../errors.js";
+import { fetched, fetchedJson } from "../files.js";
 import { atPixels } from "./range_view.js";
 import { addToMaxima, atPillars, FEATURES, toMap } from "./polar_view.js";
 
-const FORMAT = 2, DESCRIPTION = "amvnet.json";
+const FORMAT = 2, DESCRIPTION = "amvnet.json", ADVICE = "export the weights again with amvnet export";
 const POLAR = ["polar_points", "polar_pillars", "polar_map", "polar_scores"];
 // The graphs that each method needs.
 const GRAPHS = {
@@ -13,42 +14,32 @@ const GRAPHS = {
   ensemble: ["range_net", ...POLAR],
   amvnet: ["range_net", ...POLAR, "point_head"],
 };
+// In its own layout, NHWC, ONNX Runtime's WebGPU miscomputes convolutions of images with six channels (its issue 29651).
+const PROVIDERS = { webgpu: [{ name: "webgpu", preferredLayout: "NCHW" }, "wasm"], wasm: ["wasm"] };
 const PART = 16_384;  // the number of points or pillars that a graph takes at a time, which limits the memory
 
 /** Read the description in a folder of `amvnet export`. */
 export async function readDescription(folder) {
-  const response = await fetch(`${folder}/${DESCRIPTION}`);
-  if (!response.ok) {
-    throw new InputError(`${folder}: expected ${DESCRIPTION} of amvnet export, found none; export again`);
-  }
-  const description = await response.json();
+  const description = await fetchedJson(`${folder}/${DESCRIPTION}`, ADVICE);
   if (description.format !== FORMAT || !(description.method in GRAPHS) || !description.normalise) {
     throw new InputError(
       `${folder}/${DESCRIPTION}: expected format ${FORMAT}, a known method and the key normalise, found another file; ` +
-      "export again",
+      ADVICE,
     );
   }
   return description;
 }
 
 export class Networks {
-  /** Load the graphs of a folder into `ort`. `progress` is called with the share that is loaded, in [0, 1]. */
-  static async load(ort, folder, description, device, progress) {
+  /** Load the graphs of a folder into a runtime {ort, device}. */
+  static async load({ ort, device }, folder, description) {
     const networks = new Networks();
-    Object.assign(networks, { ort, description, sessions: {}, k: description.classes.length - 1 });
-    const names = GRAPHS[description.method];
-    for (const [place, name] of names.entries()) {
-      progress(place / names.length);
-      const file = `${folder}/${description.graphs[name]?.file}`, response = await fetch(file);
-      if (!response.ok) throw new InputError(`${file}: expected a graph of amvnet export, found none; export again`);
-      const options = { executionProviders: device === "webgpu" ? ["webgpu", "wasm"] : ["wasm"] };
-      networks.sessions[name] = await ort.InferenceSession.create(new Uint8Array(await response.arrayBuffer()), options);
+    Object.assign(networks, { ort, folder, description, sessions: {}, k: description.classes.length - 1 });
+    for (const name of GRAPHS[description.method]) {
+      const graph = await (await fetched(`${folder}/${description.graphs[name]?.file}`, ADVICE)).arrayBuffer();
+      networks.sessions[name] = await ort.InferenceSession.create(new Uint8Array(graph), { executionProviders: PROVIDERS[device] });
     }
     return networks;
-  }
-
-  async release() {
-    for (const session of Object.values(this.sessions)) await session.release();
   }
 
   /** Return the probabilities (n K) of points by the range view. */
@@ -60,7 +51,7 @@ export class Networks {
 
   /** Return the probabilities (n K) of points by the bird's-eye view. */
   async scorePolarView({ features, pillar, voxel, isSeen }) {
-    const { radial, angular, vertical } = this.description.polar_view, size = radial * angular;
+    const { radial, angular, vertical, nearest } = this.description.polar_view, size = radial * angular;
     const maxima = new Map();
     for (const part of partsOf(Uint32Array.from(pillar.keys()).filter((i) => isSeen[i]))) {
       const rows = new Float32Array(FEATURES * part.length);
@@ -69,6 +60,7 @@ export class Networks {
       addToMaxima(maxima, Int32Array.from(part, (i) => pillar[i]), pointFeatures);
     }
 
+    if (!maxima.size) throw new InputError(`expected points beyond ${nearest} m of the sensor, found none; leave the file out`);
     const seen = [...maxima.keys()], channels = maxima.get(seen[0]).length, pooled = new Float32Array(seen.length * channels);
     seen.forEach((place, row) => pooled.set(maxima.get(place), row * channels));
     const pillars = toMap(await this.run("polar_pillars", [[pooled, [seen.length, channels]]]), seen, size);

@@ -5,7 +5,7 @@
 // float32, else in float64. intensity is a column, and ring (count) holds the index of each point's laser; both may be
 // null.
 
-import { counted, InputError, shown } from "../errors.js";
+import { counted, InputError, quoted } from "../errors.js";
 
 // The largest number of points of a scan. A page has less memory than a program: `amvnet predict` reads ten million points.
 export const MAX_POINTS = 1_000_000;
@@ -43,7 +43,7 @@ export function requireColumns(names, name) {
   }
   if (!("x" in found && "y" in found && "z" in found)) {
     const listing = names.slice(0, 20).join(", ") || "none";
-    throw new InputError(`${name}: expected columns x, y, z, found ${shown(listing, 200)}; rename the columns`);
+    throw new InputError(`${name}: expected columns x, y, z, found ${quoted(listing, 200)}; rename the columns`);
   }
   return found;
 }

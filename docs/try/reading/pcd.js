@@ -1,6 +1,6 @@
 // Read point clouds in PCL's format: ascii, binary or binary_compressed, with columns in any order.
 
-import { InputError, shown } from "../errors.js";
+import { InputError, quoted } from "../errors.js";
 import { checkPointCount, makeCloud, requireColumns } from "./cloud.js";
 import { Header, readBinary, readColumn, readText, recordSize, TYPES, wholeOf } from "./fields.js";
 
@@ -28,7 +28,7 @@ export function readPcd(bytes, name) {
   }
   if (encoding === "binary_compressed") return makeCloud(readCompressed(bytes, start, points, fields, chosen, name), name);
   throw new InputError(
-    `${name}: expected DATA ascii, binary, binary_compressed, found ${shown(encoding, 20)}; write the file again`,
+    `${name}: expected DATA ascii, binary, binary_compressed, found ${quoted(encoding, 20)}; write the file again`,
   );
 }
 

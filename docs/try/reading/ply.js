@@ -1,6 +1,6 @@
 // Read point clouds from PLY files: the element `vertex`, ascii or binary in either byte order.
 
-import { InputError, shown } from "../errors.js";
+import { InputError, quoted } from "../errors.js";
 import { checkPointCount, makeCloud, requireColumns } from "./cloud.js";
 import { Header, readBinary, readText, recordSize, wholeOf } from "./fields.js";
 
@@ -18,10 +18,8 @@ export function readPly(bytes, name) {
   if (place < 0) throw new Error("no element vertex");
 
   const before = elements.slice(0, place), { count, fields } = elements[place];
-  if ([...before, elements[place]].some((element) => element.fields.some(({ type }) => type === "list"))) {
-    throw new InputError(`${name}: expected vertices without lists, found a list; write the points alone`);
-  }
-  for (const { type, name: property } of [...before, elements[place]].flatMap((element) => element.fields)) {
+  for (const { type, name: property } of elements.slice(0, place + 1).flatMap((element) => element.fields)) {
+    if (type === "list") throw new InputError(`${name}: expected vertices without lists, found a list; write the points alone`);
     if (!type) throw new Error(`the type of ${property}`);
   }
 
@@ -48,6 +46,7 @@ function readElements(header, name) {
     if (words[0] === "format") format = words[1] ?? "";
     if (words[0] === "element") elements.push({ name: words[1], count: wholeOf(words[2]), fields: [] });
     if (words[0] === "property") {
+      if (!elements.length) throw new Error("a property before the first element");
       const type = words[1] === "list" ? "list" : TYPES[words[1]];
       elements.at(-1).fields.push({ name: words.at(-1), type, count: 1 });
     }
@@ -55,6 +54,6 @@ function readElements(header, name) {
   if (elements.some(({ count }) => count < 0)) throw new Error("an element with a negative number of rows");
   if (FORMATS.includes(format)) return { format, elements };
   throw new InputError(
-    `${name}: expected the format ${FORMATS.join(", ")}, found ${shown(format, 30)}; write the file again`,
+    `${name}: expected the format ${FORMATS.join(", ")}, found ${quoted(format, 30)}; write the file again`,
   );
 }

@@ -122,7 +122,7 @@ function unitOf(xyz, name) {
   const distances = Float64Array.from({ length: xyz.length / 3 }, (_, i) => Math.hypot(...xyz.subarray(3 * i, 3 * i + 3)));
   const [near, median, far] = quantilesOf(distances.sort(), [0.05, 0.5, 0.95]);
 
-  // Points far from the origin are map coordinates, which `levelScan` refuses.
+  // Points far from the origin are map coordinates, which `normalise` refuses.
   if (!(median > FARTHEST_MEDIAN) || near > AROUND * far) return "m";
   if (median > LEAST_MILLIMETRES) return "mm";
   throw new InputError(

@@ -47,7 +47,7 @@ export function intensityMap(cloud, trained) {
   const rounded = values instanceof Float32Array ? Math.fround : (value) => value;
   const divided = (value) => (Number.isFinite(value) ? Math.min(Math.max(rounded(value / scale), 0), 1) : NaN);
   const linear = { text: `intensity 0 to ${Number(scale.toPrecision(6))}`, apply: () => Float32Array.from(values, divided) };
-  if (trained?.is_matched) return { ...linear, text: `${linear.text}, spread as in the training` };  // by matchScan
+  if (trained?.is_matched) return { ...linear, text: `${linear.text}, spread as in the training` };  // by matchIntensity
   if (!trained || areAlike(quantiles.map((value) => value / scale), trained.quantiles)) return linear;
 
   const matched = matching(quantiles, trained.quantiles);

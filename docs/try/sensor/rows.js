@@ -1,7 +1,5 @@
 // Choose the rows of the points in the range image: by laser if the lasers are known, else by elevation.
 
-import { median } from "./statistics.js";
-
 const OUTSIDE = 0.16;  // the largest share of points outside a field of view that is wide enough
 const SAME_ANGLE = 6;  // the largest difference of the ends of two fields of view that are alike, degrees
 const LASERS_SEEN = 0.75;  // the least share of a sensor's lasers that have returns in every scan
@@ -39,8 +37,8 @@ export function rowsOf(points, places, cloud, lasers, { view, sensor, isAsIs }) 
   if (!byElevation || (rings && !sensor.is_known)) return rings;
 
   const rows = Int32Array.from(elevations, (elevation) => rowAt(elevation, byElevation));
-  const isSame = rings && median(rows.map((row, i) => Math.abs(row - rings[i]))) < 1;  // most rings are the rows
-  return isSame ? rings : rows;
+  const isRing = rings && rows.filter((row, i) => row === rings[i]).length >= rows.length / 2;
+  return isRing ? rings : rows;
 }
 
 /**

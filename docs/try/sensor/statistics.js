@@ -9,10 +9,6 @@ export function quantilesOf(ascending, probabilities) {
   });
 }
 
-export function median(values) {
-  return quantilesOf(Float64Array.from(values).sort(), [0.5])[0];
-}
-
 /** Interpolate linearly between points (from, to) with ascending `from`; outside of them, return the value of an end. */
 export function interpolate(value, from, to) {
   if (value <= from[0]) return to[0];
