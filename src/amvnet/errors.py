@@ -28,7 +28,7 @@ def shown(value: object) -> str:
     text = reprlib.Repr()
     text.maxlevel = 2
     text.maxstring = text.maxother = 100
-    return text.repr(value)
+    return re.sub(r"\s*\n\s*", " ", text.repr(value))
 
 
 SPACES = re.compile(r"(\s+)")

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.errors import InputError, shown
+from amvnet.errors import InputError, reason_of, shown
 
 # The largest absolute value of a valid coordinate, metres. No LiDAR sees that far, and the squares
 # of much larger numbers overflow.
@@ -166,7 +166,8 @@ def as_array(values: AnyArray, expected: str) -> np.ndarray:
         array = np.asarray(numbers)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"expected {expected}, found a {type(values).__name__} ({error}); give one array"
+            f"expected {expected}, found a {type(values).__name__} "
+            f"({reason_of(error)[:60]}); give one array"
         ) from None
 
     if array.dtype.names is None and array.dtype.kind not in "fiu":

@@ -131,6 +131,7 @@ def test_missing_label_files_are_skipped_and_counted(
     assert run_cli("check", data)[0] == 0
     text = capsys.readouterr().out
     assert "train: skipped for lack of labels: 1 of 4 scans, such as b/1" in text
+    assert text.count("skipped") == 1
     assert "5 scans can be" in text
 
     # In every layout.

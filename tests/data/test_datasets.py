@@ -365,6 +365,13 @@ def test_without_the_official_split_the_last_sequence_validates_and_tests_are_le
     assert tuple(record.sequence for record in scans.val) == val
 
 
+def test_a_lone_sequence_is_not_split(tmp_path: Path) -> None:
+    dataset = open_dataset(str(make_streets(tmp_path, ("00", "11"), 1)))
+    fails(lambda: split_records(dataset, None, None), "two sequences", "00 alone", "YAML")
+    scans = split_records(dataset, None, None, with_val=True)
+    assert [record.sequence for record in scans.train] == ["00"]
+
+
 def test_only_key_frames_of_nuscenes_are_scans(tmp_path: Path) -> None:
     layout = make_nuscenes(tmp_path)
     path = tmp_path / "v1.0-mini/sample_data.json"

@@ -117,7 +117,12 @@ def test_scans_without_a_label_file_are_left_out_of_the_training(tmp_path: Path)
 
     # Without labels, b does not validate: a is left alone.
     (tmp_path / "b/1.label").unlink()
-    fails(lambda: split_records(data_of(tmp_path), None, None), "no split", "a alone")
+    fails(
+        lambda: split_records(data_of(tmp_path), None, None),
+        "two sequences",
+        "a alone",
+        "under split",
+    )
     first = tmp_path / "b/0.label"  # that was looked for
     fails(lambda: split_records(data_of(tmp_path), None, ["b"]), "labelled scans", first, "other 2")
 
@@ -330,6 +335,26 @@ def test_mistakes_in_the_file_are_said_in_one_line(
     np.save(site / "a.npy", some_points())
     path = describe(site.parent, **changes)
     fails(lambda: open_own(path), path.name if word != "found none" else word, word)
+
+
+@pytest.mark.parametrize("columns", [3, 4.5])
+def test_mistakes_in_rows_are_answered_by_keys_of_the_file(site: Path, columns: float) -> None:
+    rows = np.random.default_rng(1).normal(0, 9, (8000, 4)).astype(np.float32)
+    (site / "a.bin").write_bytes(rows.tobytes()[: int(4 * columns) * 7001])
+    data = open_own(describe(site.parent, scans="*/*.bin"))
+    (record,) = data.records(["site"])
+    fails(lambda: data.read(record, labels=False), "columns: [x, y, z", "YAML")
+    with pytest.raises(InputError, match=r"\A(?!.*--)"):  # no options, such as --columns
+        data.read(record, labels=False)
+
+
+def test_wrong_columns_in_the_file_are_called_by_its_keys(site: Path) -> None:
+    for changes, words in (
+        ({"columns": ["x", "y"]}, "own.yaml: columns: expected x, y and z"),
+        ({"columns": ["x", "y", "z"], "dtype": "float33"}, "own.yaml: dtype: expected float32"),
+        ({"dtype": "float64"}, "own.yaml: dtype: expected columns, and one type"),
+    ):
+        fails(partial(open_own, describe(site.parent, **changes)), words)
 
 
 def test_a_typo_in_a_key_follows_the_name_of_the_file(site: Path) -> None:

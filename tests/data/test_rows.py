@@ -179,7 +179,9 @@ def test_columns_of_arrays_can_be_named(table: np.ndarray, tmp_path: Path) -> No
     np.save(tmp_path / "a.npy", table[:, [2, 1, 0, 3]])
     cloud = read_cloud(tmp_path / "a.npy", RowLayout(("z", "y", "x", "intensity")))
     np.testing.assert_array_equal(cloud.xyz, table[:, :3])
-    fails(lambda: read_cloud(tmp_path / "a.npy", RowLayout(tuple("xyzabc"))), "--columns")
+    fails(
+        lambda: read_cloud(tmp_path / "a.npy", RowLayout(tuple("xyzabc"))), "names of the columns"
+    )
 
 
 @pytest.mark.parametrize(

@@ -250,6 +250,13 @@ def test_whatever_holds_the_points_gives_the_same_labels(
     assert np.array_equal(segmenter.many([points])[0].labels, result.labels)
 
 
+def test_names_of_columns_may_be_a_list(segmenter: Segmenter, result: Segmentation) -> None:
+    names = ["y", "x", "z", "intensity"]
+    swapped = POINTS[:, [1, 0, 2, 3]]
+    assert np.array_equal(segmenter(swapped, columns=names).labels, result.labels)
+    assert np.array_equal(segmenter(swapped, columns="y, x,z,intensity").labels, result.labels)
+
+
 def test_half_precision_is_read(segmenter: Segmenter) -> None:
     halves = torch.from_numpy(POINTS).bfloat16()
     expected = segmenter(halves.float().numpy()).labels
@@ -270,6 +277,7 @@ def test_masked_points_are_lost(segmenter: Segmenter) -> None:
         (None, "None"),
         ([POINTS[:5], POINTS[:6]], "list"),
         ({"x": 1}, "x"),
+        ({"x": np.arange(3000), "y": np.arange(3000)}, "'y': array"),
         ((row for row in POINTS), "generator"),
         ([], "(0,)"),
         (POINTS.astype(str), "<U32"),

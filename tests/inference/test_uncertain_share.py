@@ -62,6 +62,11 @@ def test_the_usual_share_is_trusted_and_disagreement_everywhere_is_not(usual: fl
     assert doubtful == sorted(doubtful)  # once doubtful, always doubtful
 
 
+def test_few_uncertain_points_are_never_doubtful() -> None:
+    assert not Verdict(0.0004, 0.0).is_doubtful
+    assert Verdict(0.04, 0.0).is_doubtful
+
+
 def test_the_verdict_is_a_line_with_both_shares() -> None:
     assert str(Verdict(0.25, 0.2)) == "25.0% of the points are uncertain (usual: 20.0%)"
     line = str(Verdict(0.93, 0.2))

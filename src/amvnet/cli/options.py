@@ -112,30 +112,42 @@ class TrainingChoice:
         Raises:
             InputError: if there are no such sequences, or no scans to train on.
         """
-        from amvnet.data.datasets.own import OwnScans
         from amvnet.data.datasets.select import split_records
 
         scans = split_records(dataset, self.train_sequences, self.val_sequences, with_val)
         if scans.unlabelled:
             report(f"skipped for lack of labels: {describe_records(scans.unlabelled)}")
-        if isinstance(dataset, OwnScans):
-            used = {record.name for record in (*scans.train, *scans.val)}
-            unnamed = [record for record in dataset.left_out() if record.name not in used]
-            if unnamed:
-                text = describe_records(unnamed)
-                report(f"not used, because the split does not name them: {text}")
+        _report_unnamed(scans)
         return scans
 
     def splits(self, dataset: Dataset) -> Iterator[tuple[str, Sequence[ScanRecord]]]:
-        """Yield the name of each split and its scans, including scans without labels."""
-        from amvnet.data.datasets.select import named_sequences
+        """Yield the name of each split and its scans, including scans without labels.
 
+        Scans that the split does not name are reported.
+
+        Raises:
+            InputError: as `scans`.
+        """
+        from amvnet.data.datasets.select import named_sequences, split_records
+
+        _report_unnamed(split_records(dataset, self.train_sequences, self.val_sequences))
         train, val = named_sequences(dataset, self.train_sequences, self.val_sequences)
-        self.scans(dataset)  # reports scans that are not used
         yield "train", dataset.records(train)
         yield "val", dataset.records(val)
         with suppress(InputError):  # there may be no test split
             yield "test", dataset.labelled(dataset.records(dataset.official("test")))
+
+
+def _report_unnamed(scans: TrainingScans) -> None:
+    """Report the scans of a user's dataset that its split does not name."""
+    from amvnet.data.datasets.own import OwnScans
+
+    if isinstance(scans.dataset, OwnScans):
+        used = {record.name for record in (*scans.train, *scans.val)}
+        unnamed = [record for record in scans.dataset.left_out() if record.name not in used]
+        if unnamed:
+            text = describe_records(unnamed)
+            report(f"not used, because the split does not name them: {text}")
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ class Pipeline:
         folder = self.output.folder
         is_new = not folder.exists()
         earlier = read_journals(folder, settings) if self.output.resume else {}
-        self._check_output(earlier)
+        check_output(self.scans, self.output, earlier)
         done = self._still_done(earlier)
         remaining = [scan for scan in self.scans if _key(scan) not in done]
 
@@ -153,31 +153,6 @@ class Pipeline:
             with suppress(OSError):  # the folder is empty only if all scans were broken
                 folder.rmdir()
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
-
-    def _check_output(self, earlier: Mapping[str, Entry]) -> None:
-        """Raise InputError if a file may not be written.
-
-        Args:
-            earlier: the scans whose files may be replaced.
-        """
-        folder = self.output.folder
-        _check_names(self.scans)
-        inputs = list(self.output.also_read)
-        own_files: list[Path] = []
-        new_files: dict[Path, Signature] = {}
-        for scan in self.scans:
-            inputs += scan.files
-            for path, signature in self.output.files_of(scan).items():
-                if _key(scan) in earlier:
-                    own_files.append(inside(folder, path))
-                else:
-                    new_files[inside(folder, path)] = signature
-            _check_folder(scan, self.output)
-
-        check_not_read(own_files, inputs)
-        # The journal of a run that was killed lacks the files that it wrote last.
-        is_killed = self.output.resume and (folder / UNFINISHED).exists()
-        check_outputs(new_files, inputs, self.output.overwrite or is_killed)
 
     def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return the entries of an earlier run whose scans need not be segmented again.
@@ -313,6 +288,34 @@ def check_faults(faults: Sequence[str], total: int) -> None:
             f"{total - len(faults)} of {total} scans segmented, {len(faults)} broken",
             list(faults),
         )
+
+
+def check_output(
+    scans: Sequence[InputScan], output: OutputOptions, earlier: Mapping[str, Entry] | None = None
+) -> None:
+    """Raise InputError if a file of some scans may not be written.
+
+    Args:
+        earlier: the entries of the run that is resumed, whose files may be replaced.
+    """
+    folder = output.folder
+    _check_names(scans)
+    inputs = list(output.also_read)
+    own_files: list[Path] = []
+    new_files: dict[Path, Signature] = {}
+    for scan in scans:
+        inputs += scan.files
+        for path, signature in output.files_of(scan).items():
+            if earlier is not None and _key(scan) in earlier:
+                own_files.append(inside(folder, path))
+            else:
+                new_files[inside(folder, path)] = signature
+        _check_folder(scan, output)
+
+    check_not_read(own_files, inputs)
+    # The journal of a run that was killed lacks the files that it wrote last.
+    is_killed = output.resume and (folder / UNFINISHED).exists()
+    check_outputs(new_files, inputs, output.overwrite or is_killed)
 
 
 def _check_names(scans: Sequence[InputScan]) -> None:

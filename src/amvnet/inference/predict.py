@@ -10,7 +10,7 @@ from pathlib import Path
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.journal import Entry, describe_other_run
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import Pipeline, Segment, check_faults
+from amvnet.inference.pipeline import Pipeline, Segment, check_faults, check_output
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
@@ -48,7 +48,8 @@ def predict(
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
         request: how the scans are labelled, and which files are written for each.
         make_segmenter: returns the segmenter that computes the labels, with the weights, method and
-            tau of the request. It is called once the inputs are listed, because it may take long.
+            tau of the request. It is called after the inputs and the output are checked, because it
+            may take long.
         folder: the folder for the files.
         sequences, split: which scans of datasets to use, as `ScanOptions` takes them.
         batch: the number of scans that go through the networks together.
@@ -78,13 +79,16 @@ def predict(
                 scan.written = classes.target
         taxonomy = classes.target
 
+    output = request.output(folder, overwrite=overwrite, resume=resume)
+    output = replace(output, also_read=also_read)
+    if not resume:  # the files of the earlier run are known only with the precision
+        check_output(scans, output)
     segmenter = make_segmenter()
     request = replace(request, precision=segmenter.engine.precision)  # not "auto"
-    output = request.output(folder, overwrite=overwrite, resume=resume)
     pipeline = Pipeline(
         scans,
         segment_by(segmenter, classes),
-        replace(output, also_read=also_read),
+        output,
         taxonomy,
         batch=batch,
         at_once=segmenter.at_once,

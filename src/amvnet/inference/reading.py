@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -27,7 +28,7 @@ EXPECTED = "points of shape (N, 3 or more) with columns x, y, z, intensity"
 
 def checked_scan(
     points: AnyArray | Scan,
-    columns: str | None = None,
+    columns: str | Sequence[str] | None = None,
     trained: TrainedIntensity | None = None,
 ) -> Scan:
     """Return a scan, or the scan that `array_scan` makes of an array; check that it has a point.
@@ -40,7 +41,9 @@ def checked_scan(
 
 
 def array_scan(
-    points: AnyArray, columns: str | None = None, trained: TrainedIntensity | None = None
+    points: AnyArray,
+    columns: str | Sequence[str] | None = None,
+    trained: TrainedIntensity | None = None,
 ) -> Scan:
     """Return the scan of an array that has the columns of a scan file.
 
@@ -48,15 +51,15 @@ def array_scan(
         points: (N, 3 or more) x, y, z in metres, intensity in [0, 1], ring; or an array of any
             shape with fields of these names, in any order, such as `read_points` of ROS returns.
             Anything that `as_array` takes may stand for an array.
-        columns: the names of the columns in order, separated by commas. Only x, y, z, intensity and
-            ring are used. By default, named fields keep their names; other columns are x, y, z and
-            intensity, followed by the ring if the values suggest it.
+        columns: the names of the columns in order, as a list or separated by commas. Only x, y, z,
+            intensity and ring are used. By default, named fields keep their names; other columns
+            are x, y, z and intensity, followed by the ring if the values suggest it.
         trained: fills in intensities with a warning if there are none; without it, they are 0.
 
     Raises:
         InputError: if the shape is another one, or names of columns are missing.
     """
-    names = parse_layout(columns, None).columns
+    names = parse_layout(columns).columns
     with errors_of("scan"):
         array = as_array(points, EXPECTED)
     if array.dtype.names is not None:

@@ -24,6 +24,9 @@ SHOWN_CLASSES = 3  # largest number of classes that the short description of a r
 # streets, real scans of the right sensor have a ratio of up to 5, both at a tau of 0.5 and at 0.82;
 # scans in another frame or unit have a larger one (docs/log.md).
 UNUSUAL_ODDS = 5.0
+# The share of uncertain points below which labels are not doubtful, whatever the usual share is.
+# Networks that hardly ever disagree have a usual share near 0.
+FEW_UNCERTAIN = 0.01
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,9 @@ class Verdict:
     def is_doubtful(self) -> bool:
         """Whether so many points are uncertain that the weights hardly know such scans.
 
-        False if the usual share is not known.
+        False if the usual share is not known, or few points are uncertain.
         """
-        if self.usual is None:
+        if self.usual is None or self.share < FEW_UNCERTAIN:
             return False
         return self.share * (1 - self.usual) > UNUSUAL_ODDS * self.usual * (1 - self.share)
 

@@ -83,7 +83,9 @@ class Segmenter:
         return f"<Segmenter {self.method} on {self.device}, {engine.precision}: {self.weights!r}>"
 
     def __call__(
-        self, points: AnyArray | Scan | Path | str, columns: str | None = None
+        self,
+        points: AnyArray | Scan | Path | str,
+        columns: str | Sequence[str] | None = None,
     ) -> Segmentation:
         """Segment one scan.
 
@@ -95,8 +97,8 @@ class Segmenter:
                 - the path of a scan file. The scan is normalised to the weights, as `amvnet
                   predict` normalises it.
             columns: the names of the columns of an array or of a file of rows, such as
-                "x,y,z,intensity,ring". By default, named fields keep their names, and other columns
-                are recognised by their number and their values.
+                "x,y,z,intensity,ring" or a list of them. By default, named fields keep their names,
+                and other columns are recognised by their number and their values.
 
         Raises:
             InputError: if there is no valid point, more than a few intensities are out of range,
@@ -111,7 +113,7 @@ class Segmenter:
         if not isinstance(points, Path | str):
             return self._segment([checked_scan(points, columns, self.intensity)])[0]
 
-        scans, assumed = self._open(points, layout=parse_layout(columns, None))
+        scans, assumed = self._open(points, layout=parse_layout(columns))
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"

@@ -65,6 +65,10 @@ class HeadStage(Stage):
         point, rows, labels, stands_for = batch
         prediction = self.trained(point, rows).argmax(dim=1) + 1
 
+        # Where the networks agree, AMVNet's labels are the ensemble's.
+        if self.val_points is not None and not self.val_points.are_uncertain:
+            return
+
         # Each point counts as many times as the number of points that it stands for.
         size = len(self.matrix)
         cells = (labels * size + prediction).cpu().numpy()

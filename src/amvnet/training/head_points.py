@@ -52,6 +52,10 @@ class HeadPoints:
         labels: (U,) train ids of the points.
         certain: (K + 1, K + 1) confusion matrix of the ensemble over the certain points.
         uncertain_share: share of the labelled points that are uncertain, in [0, 1].
+
+    Attributes:
+        are_uncertain: whether the points are uncertain. If the networks agree everywhere, they are
+            points of all kinds, for which AMVNet takes the labels of the ensemble.
     """
 
     def __init__(
@@ -69,6 +73,7 @@ class HeadPoints:
         self.labels = labels
         self.certain = certain
         self.uncertain_share = uncertain_share
+        self.are_uncertain = True
 
         self._files = files
         self._rows = np.empty(len(files), dtype=np.int64)  # the place of each point in its file
@@ -201,9 +206,11 @@ class PointGatherer:
         points = self._gather(scans, keys, folder, assertion, report)
         if len(points) < least:
             report("head: the networks agree everywhere, so it learns from all kinds of points")
-            share = points.uncertain_share
+            agreed = points
             points = self._gather(scans, keys, folder, _everywhere, report)
-            points.uncertain_share = share
+            points.uncertain_share = agreed.uncertain_share
+            points.certain = agreed.certain
+            points.are_uncertain = False
 
         if len(points) < least:
             raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ from amvnet.errors import InputError
 from amvnet.models.methods import PAPER_METHODS, Compute, MethodName, widest_method
 
 if TYPE_CHECKING:
+    from amvnet.data.datasets.base import ScanRecord
     from amvnet.evaluation.metrics import Evaluation
 
 
@@ -61,6 +63,13 @@ def evaluate(
     from amvnet.outputs import check_outputs
     from amvnet.weights.file import load
 
+    def check_files(records: Sequence[ScanRecord]) -> None:
+        """Check that all files can be written, before time is spent on networks and scans."""
+        outputs = {} if pictures is None else pictures_of(records, pictures)
+        if json is not None:
+            outputs[json] = REPORT
+        check_outputs(outputs, [data, weights, classes], overwrite)
+
     processes = join_processes()
     mapping = None if classes is None else class_map(classes)
     if weights is not None and predictions is None:
@@ -68,6 +77,7 @@ def evaluate(
         opened = open_dataset(data, loaded.taxonomy if mapping is None else None)
         dataset = normalised(opened, normaliser_for(loaded))
         records = choice.records(dataset)
+        check_files(records)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]
         device = processes.device(choose_device(compute.device, compute.engine))
@@ -79,17 +89,13 @@ def evaluate(
             raise InputError("--tau: expected --weights, found --predictions; leave --tau out")
         dataset = open_dataset(data)
         records = choice.records(dataset)
+        check_files(records)
         labeller = label_from_files(dataset, predictions, mapping)
     else:
         raise InputError(
             "expected either --weights or --predictions, found both or neither; give one of them"
         )
 
-    # Check this before any scan is scored, so that no time is wasted if a file cannot be written.
-    outputs = {} if pictures is None else pictures_of(records, pictures)
-    if json is not None:
-        outputs[json] = REPORT
-    check_outputs(outputs, [data, weights, classes], overwrite)
     for path in (json, pictures):
         if path is not None:
             make_folder(path.parent)

@@ -123,6 +123,7 @@ def _parse(path: Path, tree: Any) -> Description:
         layout=RowLayout(
             columns=_texts("columns", tree.get("columns", ())),
             dtypes=_texts("dtype", tree.get("dtype", USUAL_TYPE)),
+            in_yaml=True,
         ),
     )
 

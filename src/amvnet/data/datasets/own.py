@@ -67,7 +67,7 @@ class OwnScans(Dataset):
                 found = f"no split{alone}"
             raise InputError(
                 f"{self.spec}: expected scans of the split {split}, found {found}; name them under "
-                "split, or give --split all or the names of sequences"
+                "split, or name sequences to use"
             )
         return tuple(sorted(names))
 

@@ -63,6 +63,9 @@ def named_sequences(
     dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
 ) -> tuple[list[str], list[str]]:
     """Return the sequences to train on and to validate with; `split_records` has the arguments."""
+    if not (train or val or with_val or dataset.is_split):
+        _require_two(dataset)
+
     # A sequence that the user named for one purpose is not used for the other by default.
     by_default = _sequences_with_val if with_val else Dataset.sequences
     names_val = list(val) if val else _without(by_default(dataset, "val"), train or ())
@@ -91,6 +94,17 @@ def _sequences_with_val(dataset: Dataset, split: str) -> tuple[str, ...]:
         return dataset.sequences(split)
     except InputError:
         return () if dataset.is_split or split == "val" else dataset.trainable()
+
+
+def _require_two(dataset: Dataset) -> None:
+    """Raise InputError if the sequences do not suffice for a training and its validation."""
+    names = dataset.trainable()
+    if len(names) < 2:
+        raise InputError(
+            f"{dataset.spec}: expected two sequences with labels, one to train on and one to "
+            f"validate with, found {' '.join(names) or 'none'} alone; add another one, or divide "
+            "it under split in a YAML file that describes the scans (docs/own_data.md)"
+        )
 
 
 def _refuse_test(dataset: Dataset, names: Sequence[str]) -> None:

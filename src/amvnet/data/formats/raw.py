@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from amvnet.data.formats.cloud import MAX_RINGS, Cloud, check_point_count
-from amvnet.data.formats.rows import ADVICE, NAMES, UNKNOWN, RowLayout, are_rings, named_cloud
+from amvnet.data.formats.rows import NAMES, UNKNOWN, RowLayout, are_rings, named_cloud
 from amvnet.errors import InputError, readable
 
 KITTI_COLUMNS = 4  # the number of columns: x, y, z, intensity
@@ -53,17 +53,18 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         kitti = KITTI_ROWS.record.itemsize
         nuscenes = NUSCENES_ROWS.record.itemsize
         found = "values that fit neither"
-        advice = ADVICE
+        advice = layout.advice
         if len(data) % kitti and len(data) % nuscenes:
             found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
-            advice = f"copy the file again if it is truncated, or {ADVICE}"
+            advice = f"copy the file again if it is truncated, or {layout.advice}"
         if len(data) % XYZ_BYTES == 0:
-            advice = f"say --columns x,y,z if the rows have no more, or {advice}"
+            advice = f"say {layout.advise(*'xyz')} if the rows have no more, or {advice}"
         raise InputError(
             f"{path}: expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found "
             f"{found}; {advice}"
         )
     usual = usual or (NUSCENES_ROWS if is_named else KITTI_ROWS)
+    usual = replace(usual, in_yaml=layout.in_yaml)
 
     return replace(_to_cloud(data, path, usual), note="")
 
@@ -73,7 +74,7 @@ def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
     if len(data) % size:
         raise InputError(
             f"{path}: expected {layout.describe()}, found {len(data)} bytes, which is no multiple "
-            f"of {size}; {ADVICE}, or copy the file again"
+            f"of {size}; {layout.advice}, or copy the file again"
         )
 
     check_point_count(len(data) // size, path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from amvnet.errors import InputError
 
 NAMES = ("x", "y", "z", "intensity", "ring")  # the names of the columns in the usual order
 USUAL_TYPE = "float32"
-ADVICE = "say what the rows hold, for example --columns x,y,z,intensity,ring --dtype float32"
 
 # These limits tell rings from labels. On whole scans, the largest ring has at most 2.1 times as
 # many points as the mean ring; the largest class has at least 2.8 times as many as the mean class.
@@ -39,6 +38,8 @@ class RowLayout:
         columns: the name of each column, in order; empty if the user does not state them. Columns
             whose names the readers do not know, such as "time" or "_", are not read.
         dtypes: NumPy's names of the types: one for all columns, or one for each column.
+        in_yaml: whether a YAML file states the layout, or else options of a command; messages
+            name the keys or the options.
 
     Raises:
         InputError: if a coordinate is missing or named twice, a type is unknown, or there are
@@ -47,28 +48,31 @@ class RowLayout:
 
     columns: tuple[str, ...] = ()
     dtypes: tuple[str, ...] = (USUAL_TYPE,)
+    in_yaml: bool = field(default=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
+        option = "" if self.in_yaml else "--"
         lower = list(map(str.lower, self.columns))
         if self.columns and any(lower.count(axis) != 1 for axis in "xyz"):
             raise InputError(
-                f"--columns: expected x, y and z, each once, found {','.join(self.columns)!a}; "
-                "name all columns in order, for example x,y,z,intensity,ring"
+                f"{option}columns: expected x, y and z, each once, found "
+                f"{','.join(self.columns)!a}; name all columns in order, for example "
+                f"{','.join(NAMES)}"
             )
 
         for dtype in self.dtypes:
             if not _is_number(dtype):
                 raise InputError(
-                    f"--dtype: expected float32, float64, float16, uint8, ..., found {dtype!a}; "
-                    "give the type of all columns, or a type for each column, with commas"
+                    f"{option}dtype: expected float32, float64, float16, uint8, ..., found "
+                    f"{dtype!a}; give the type of all columns, or a type for each column"
                 )
 
         is_stated = self.dtypes != (USUAL_TYPE,)
         fits_columns = len(self.dtypes) in (1, len(self.columns))
         if is_stated and not (self.columns and fits_columns):
             raise InputError(
-                "--dtype: expected --columns, and one type or a type for each column, found "
-                f"{len(self.columns)} columns and {len(self.dtypes)} types; name the columns"
+                f"{option}dtype: expected {option}columns, and one type or a type for each column, "
+                f"found {len(self.columns)} columns and {len(self.dtypes)} types; name the columns"
             )
 
     @property
@@ -76,6 +80,18 @@ class RowLayout:
         """The NumPy type of a row, with the fields "0", "1", ..."""
         dtypes = self.dtypes * len(self.columns) if len(self.dtypes) == 1 else self.dtypes
         return np.dtype([(str(index), dtype) for index, dtype in enumerate(dtypes)])
+
+    def advise(self, *columns: str) -> str:
+        """Return in words how the user states columns: as an option, or in the YAML file."""
+        if self.in_yaml:
+            return f"columns: [{', '.join(columns)}] in the YAML file"
+        return f"--columns {','.join(columns)}"
+
+    @property
+    def advice(self) -> str:
+        """What the user can do if rows are not read, for messages."""
+        dtype = " (and dtype)" if self.in_yaml else f" --dtype {USUAL_TYPE}"
+        return f"say what the rows hold, for example {self.advise(*NAMES)}{dtype}"
 
     def describe(self) -> str:
         """Return the layout in words, for messages."""
@@ -85,8 +101,8 @@ class RowLayout:
 UNKNOWN = RowLayout()
 
 
-def parse_layout(columns: str | None, dtype: str | None) -> RowLayout:
-    """Return the layout that the options --columns and --dtype describe."""
+def parse_layout(columns: str | Sequence[str] | None, dtype: str | None = None) -> RowLayout:
+    """Return the layout that the options --columns and --dtype describe; lists have no commas."""
     return RowLayout(_split(columns), _split(dtype or USUAL_TYPE))
 
 
@@ -115,7 +131,7 @@ def named_cloud(
     if len(columns) < len(names):
         raise InputError(
             f"{name}: expected {len(names)} columns ({','.join(names)}), found {len(columns)}; "
-            "correct --columns"
+            "correct the names of the columns"
         )
 
     arrays = {}
@@ -171,8 +187,10 @@ def are_rings(xyz: np.ndarray, values: np.ndarray) -> bool:
     return bool(spread <= ELEVATION_SPREAD * elevation.var())
 
 
-def _split(text: str | None) -> tuple[str, ...]:
-    return () if text is None else tuple(name.strip() for name in text.split(","))
+def _split(names: str | Sequence[str] | None) -> tuple[str, ...]:
+    if names is None:
+        return ()
+    return tuple(name.strip() for name in (names.split(",") if isinstance(names, str) else names))
 
 
 def _is_color(columns: np.ndarray) -> bool:

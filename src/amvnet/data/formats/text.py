@@ -82,7 +82,7 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
             if max(indices) >= table.count:
                 raise InputError(
                     f"{path}: expected {len(names)} columns ({','.join(names)}), "
-                    f"found {table.count}; correct --columns"
+                    f"found {table.count}; correct the names of the columns"
                 )
             values = _read_values(path, table, indices)
             return named_cloud(list(values.T), [names[index] for index in indices], str(path))
