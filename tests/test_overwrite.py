@@ -372,6 +372,8 @@ def test_what_a_killed_run_wrote_last_is_written_again(world: Path, tmp_path: Pa
     (tmp_path / JOURNAL).unlink()
     (tmp_path / UNFINISHED).write_text("".join(lines[:-1]))
     (tmp_path / "b.label").write_bytes(b"half")
+    assert "--overwrite" in refusal(command)
+    assert (tmp_path / "b.label").read_bytes() == b"half"
 
     succeed(f"{command} --resume")
     assert files(tmp_path) == {"a.label", "b.label"}

@@ -226,6 +226,31 @@ def test_semaphores_of_a_stopped_command_are_cleaned_up_in_silence(given: str) -
         assert process.stderr.read() == "amvnet: stopped\n"
 
 
+IN_DESTRUCTOR = """
+import os, signal, sys, time
+from amvnet.cli import main
+
+class Signals:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+def run(command, arguments):
+    Signals()
+    time.sleep(60)
+
+main.run = run
+sys.argv = ["amvnet", "info"]
+sys.exit(main.main())
+"""
+
+
+def test_a_signal_during_a_destructor_ends_the_command_with_one_line() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", IN_DESTRUCTOR], capture_output=True, text=True, timeout=30
+    )
+    assert (done.returncode, done.stderr) == (143, "amvnet: stopped\n")
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights, scans that take seconds, and the labels of `predict`."""

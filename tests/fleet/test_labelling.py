@@ -20,8 +20,12 @@ from amvnet.fleet.labelling import IS_FATAL, LabelScans, MeasureSensors, statist
 from amvnet.fleet.manifest import list_scans
 from amvnet.fleet.results import results_schema
 from amvnet.fleet.storage import Place
+from amvnet.inference.listing import InputScan
+from amvnet.inference.pipeline import Segment
+from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation
+from amvnet.scan import Scan
 from amvnet.weights.file import load
 
 from fixtures.commands import fails, succeed
@@ -70,6 +74,24 @@ def test_labels_in_a_bucket_are_those_of_predict(
     assert [row["labels"] for row in rows] == [
         f"s3://fleet/labels/{row['scan']}.label" for row in rows
     ]
+
+
+def test_the_labels_come_last_into_a_bucket(
+    labelling: LabellingRequest, fleet: Path, bucket: Bucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If they are there, the other files are there, whenever the worker is killed."""
+    written = []
+    write = Place.write
+
+    def record(place: Place, content: bytes) -> None:
+        written.append(Path(place.path).name)
+        write(place, content)
+
+    monkeypatch.setattr(Place, "write", record)
+    request = replace(labelling, scores=True, uncertain=True)
+    label(request, "s3://fleet/last", [f"{fleet}/scans/drive1/000000.bin"])
+    assert len(written) == 3
+    assert written[-1] == "000000.label"
 
 
 def test_labels_in_a_folder_are_those_of_predict_in_each_format(
@@ -170,6 +192,35 @@ def test_a_fault_of_a_library_is_the_row_of_its_scan_and_the_others_are_labelled
     for index in (0, 1, 3):
         expected = fleet / f"labels/drive1/{index:06d}.label"
         assert (tmp_path / f"{index:06d}.label").read_bytes() == expected.read_bytes()
+
+
+def test_scans_beside_a_fault_are_normalised_as_their_drive(
+    labelling: LabellingRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if nobody has measured the drive before: each scan is then labelled on its own."""
+    (tmp_path / "drive").mkdir()
+    for index in range(4):
+        points, _ = street(index)
+        points[:, 3] *= 4 if index == 3 else 1  # alone, the scan would be one from 0 to 255
+        points.tofile(tmp_path / f"drive/{index}.bin")
+    (block,) = list(list_scans([f"{tmp_path}/drive"], NOWHERE))
+    LabelScans(labelling, str(tmp_path / "whole"))(block)
+
+    def segment_by_a_broken_library(*arguments: Any) -> Segment:
+        segment = segment_by(*arguments)
+
+        def fail_at_one(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+            if any(scan.name == "2" for scan in inputs):
+                raise ZeroDivisionError
+            return segment(inputs, scans)
+
+        return fail_at_one
+
+    monkeypatch.setattr("amvnet.fleet.labelling.segment_by", segment_by_a_broken_library)
+    rows = LabelScans(labelling, str(tmp_path / "out"))(block).to_pylist()
+    assert [row["error"] is None for row in rows] == [True, True, False, True]
+    for name in ("0.label", "1.label", "3.label"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_what_is_no_scan_file_is_a_broken_scan_in_one_line(

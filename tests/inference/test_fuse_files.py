@@ -16,7 +16,9 @@ import pytest
 
 import amvnet
 from amvnet import fuse
+from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.inference.scores import ScoreFolder, ScorePair
 from amvnet.weights.file import load, save
 
 from fixtures.commands import commands_of, files, run_cli
@@ -110,7 +112,9 @@ def test_the_head_and_tau_count(world: Path, tmp_path: Path) -> None:
     assert (read_labels(tmp_path / "all") != without_head).mean() > 0.1
 
 
-def test_single_scans_are_fused_and_lost_points_have_no_class(world: Path, tmp_path: Path) -> None:
+def test_single_scans_are_fused_and_lost_points_have_no_class(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     points = street(9, 300)[0]
     points[7] = np.nan
     points.tofile(tmp_path / "a.bin")
@@ -126,6 +130,7 @@ def test_single_scans_are_fused_and_lost_points_have_no_class(world: Path, tmp_p
     scores = ("--scores-a", tmp_path / "rv", "--scores-b", tmp_path / "bev")
     options = (*scores, "--head", world / "w.safetensors", "--out", out)
     assert run_cli("fuse", tmp_path / "a.bin", *options) == (0, "")
+    assert "no opinion" not in capsys.readouterr().out  # lost points do not count
 
     labels = read_labels(out)
     assert labels[7] == 0
@@ -367,6 +372,28 @@ def test_the_run_resumes_with_its_own_scores_only(world: Path, run: Path) -> Non
     code, error = run_cli(*arguments, *scores, "--logits", "a")
     assert code == 2
     assert "scores" in error
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz"])
+def test_a_digest_of_scores_sees_any_changed_point_of_an_archive_and_the_last_of_an_array(
+    ending: str, tmp_path: Path
+) -> None:
+    record = ScanRecord("a", "00", tmp_path / "a.bin", None, prediction="a.label")
+    scores = np.full((2000, 19), 1 / 19, np.float32)
+
+    def digest() -> str:
+        path = tmp_path / f"a.{ending}"
+        np.save(path, scores) if ending == "npy" else np.savez(path, rv=scores)
+        folder = ScoreFolder("a", tmp_path)
+        return ScorePair(folder, folder).digests([record])["a"]
+
+    digests = {digest()}
+    for point in (-1,) if ending == "npy" else (0, 1000, -1):
+        scores[point] = np.eye(19)[3]
+        digests.add(digest())
+        scores[point] = 1 / 19
+    assert digest() in digests
+    assert len(digests) == (2 if ending == "npy" else 4)
 
 
 # ---- the page of the docs

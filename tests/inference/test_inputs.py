@@ -12,17 +12,22 @@ import numpy as np
 import pytest
 
 import amvnet
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats import find
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
+from amvnet.inference import reading
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.predict import ADVICE, report_certainty
 from amvnet.inference.reading import array_scan, normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
+from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.measure import MEASURED_SCANS
+from amvnet.sensors.normalise import Normaliser
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import Weights, save
 
@@ -94,6 +99,20 @@ def test_a_scan_of_another_sensor_after_the_first_ones_is_measured_alone_and_tol
     np.testing.assert_array_equal(scans["b"].points, expected.points)
     assert len(lines) == 2
     assert "another sensor" in lines[1]
+
+
+def test_a_sensor_in_the_yaml_file_counts_unless_the_command_describes_one(tmp_path: Path) -> None:
+    write(tmp_path / "scans", "a", "vlp16", 1.2)
+    path = tmp_path / "own.yaml"
+    path.write_text('classes: {a: 1, b: 2}\nscans: "scans/*"\nsensor: {height: 1.5}\n')
+
+    for described, expected in ((None, 1.5), (Sensor(height=2.0), 2.0)):
+        dataset = reading.normalised(
+            open_dataset(str(path)), normaliser_for(weights_for(), described)
+        )
+        assert isinstance(dataset, OwnScans)
+        assert isinstance(dataset.normalise, Normaliser)
+        assert dataset.normalise.sensor.height == expected
 
 
 def test_a_sensor_that_misses_points_is_still_the_same_one(tmp_path: Path) -> None:

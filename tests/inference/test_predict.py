@@ -322,6 +322,19 @@ def test_a_finished_run_makes_only_labels_that_are_gone(
     assert changed == {"000003.label"}
 
 
+def test_a_scan_that_lacks_one_of_its_files_is_segmented_again(world: Path, tmp_path: Path) -> None:
+    scan = shutil.copy(world / "scans/000003.bin", tmp_path)
+    command = f"predict {scan} --weights {world}/{WEIGHTS} --scores --uncertain --resume"
+    command += f" --out {tmp_path}/out"
+    succeed(command)
+    written = files(tmp_path / "out")
+    assert len(written) == 3
+    for name in written:
+        (tmp_path / "out" / name).unlink()
+        succeed(command)
+        assert files(tmp_path / "out") == written
+
+
 def test_scans_before_the_first_ones_change_how_all_are_normalised(
     world: Path, whole: Path, tmp_path: Path
 ) -> None:

@@ -11,7 +11,7 @@ import pytest
 from amvnet.data.formats.cloud import Cloud
 from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
-from amvnet.sensors.frame import find_frame
+from amvnet.sensors.frame import Frame, find_frame
 from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
 
@@ -85,6 +85,14 @@ def test_an_origin_on_the_ground_or_below_it_is_mended(
     expected, _ = normalise(xyz)
     scan, _ = normalise(xyz + np.array([0, 0, rise]), Sensor(**options))
     assert_alike(scan, expected, atol=0.16)  # a difference in height of 0.15 m is left alone
+
+
+def test_the_origin_of_a_sensor_that_is_said_to_be_low_is_not_on_the_ground() -> None:
+    frame = Frame(height=0.25)
+    assert frame.is_on_ground(Sensor())
+    assert frame.is_on_ground(Sensor(height=1.0))
+    assert not frame.is_on_ground(Sensor(height=0.2))
+    assert frame.rises(Sensor(height=0.2), usual_height=1.7) == (0, 0.2 - 1.7)
 
 
 @pytest.mark.parametrize("z", [-1.73, 0, 1.73])

@@ -141,6 +141,15 @@ def test_missing_intensities_are_filled_in_as_the_weights_need_it(
         assert "much worse" in lines[0]
 
 
+def test_intensities_are_optional_if_both_networks_have_learnt_to_do_without_them() -> None:
+    for shares, expected in (((0.25, 0.25), True), ((0.25, 0.1), False), ((0.0, 0.25), False)):
+        parts = zip(("range_net", "polar_net"), shares, strict=True)
+        training = {part: {"augment": {"no_intensity": share}} for part, share in parts}
+        trained = trained_intensity(training, "hdl64e")
+        assert trained is not None
+        assert trained.is_optional == expected
+
+
 def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
     clouds = []
     for seed, (height, scale) in enumerate(((1.73, 1), (1.0, 255), (2.5, 255), (1.73, 1))):

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 import amvnet
 from amvnet.cli.main import main
+from amvnet.config.schema import RangeViewConfig
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
@@ -23,6 +24,7 @@ from amvnet.inference.reading import normaliser_for
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
+from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lasers import SensorGeometry, measure
 from amvnet.sensors.lidars import (
     AXES,
@@ -33,7 +35,7 @@ from amvnet.sensors.lidars import (
     rotation_from_degrees,
 )
 from amvnet.sensors.measure import MEASURED_SCANS, raise_points
-from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.normalise import Expectation, Normaliser, _row_view
 from amvnet.weights.file import save
 from lidarstreets import LIDAR_MODELS
 
@@ -70,6 +72,16 @@ def test_the_ground_is_found_on_a_slope_and_among_stray_points(slope: float) -> 
     points[is_stray, 2] += rng.uniform(-1, 4, is_stray.sum()).astype(np.float32)
 
     assert ground_height(points) == pytest.approx(1.5, abs=0.08)
+
+
+def test_the_ground_is_the_lower_plane_even_if_more_cells_show_the_tops_of_hedges() -> None:
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(-18, 18, (2, 20_000))
+    is_hedge = (np.floor(x / 2) + np.floor(y / 2)) % 5 < 3
+    z = np.where(is_hedge, -0.6, -1.7) + rng.normal(0, 0.01, len(x))
+    ground = find_ground(np.column_stack([x, y, z]))
+    assert ground is not None
+    assert ground.height == pytest.approx(1.7, abs=0.05)
 
 
 def test_what_a_scan_does_not_tell_stays_unknown() -> None:
@@ -211,6 +223,16 @@ def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None
 
     assert (np.diff(rows) <= 0).all()
     assert set(np.bincount(rows).tolist()) <= {3, 4, 5}  # 64 lasers on the 16 rows of these weights
+
+
+def test_rows_by_elevation_reach_half_a_row_beyond_the_lasers() -> None:
+    points, _ = place(np.linspace(-20, 20, 64), 1.7)
+    view = RangeViewConfig(height=16, width=64, fov_up=3, fov_down=-25)
+    lasers = SensorGeometry(64, fov_up=20.0, fov_down=-20.0)
+    chosen = _row_view(points, lasers, Expectation(view, Sensor()))
+    assert chosen is not None
+    half = 40 / 16 / 2
+    assert (chosen.fov_up, chosen.fov_down) == (20 + half, -20 - half)
 
 
 @pytest.mark.parametrize("kind", ["none", "right", "reversed"])

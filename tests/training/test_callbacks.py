@@ -11,7 +11,10 @@ import pytest
 import torch
 from torch import nn
 
+from amvnet.config.schema import HeadTraining, NetworkTraining, Recipe, TrainingConfig
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
+from amvnet.training.run_folder import DONE
+from amvnet.training.stage import _epochs_after
 from amvnet.weights.file import load
 
 from fixtures.tiny import fresh_weights
@@ -151,3 +154,27 @@ def test_a_line_has_percent_and_the_whole_time_left(monkeypatch: pytest.MonkeyPa
         "rv epoch 3/5: loss 1.500, val mIoU 12.3% (classes present 40.0%); epoch in 0:00:10, "
         "0:00:20 left, about 0:01:20 with the stages that follow"
     ]
+
+
+@pytest.mark.parametrize(
+    ("resume", "views", "later"), [(False, 0, 7 + 1), (False, 4, 7 + 4), (True, 4, 4)]
+)
+def test_the_later_stages_are_those_that_are_not_finished(
+    resume: bool, views: int, later: int, tmp_path: Path
+) -> None:
+    """The head takes as long as scoring all scans once for each view."""
+    (tmp_path / "bev").mkdir()
+    (tmp_path / "bev" / DONE).touch()
+    training = TrainingConfig(
+        bev=NetworkTraining(epochs=7, batch=1, lr=0.1), head=HeadTraining(views=views)
+    )
+    stage: Any = SimpleNamespace(name="rv")
+    plan: Any = SimpleNamespace(
+        stages=("rv", "bev", "head"),
+        recipe=Recipe(training=training),
+        resume=resume,
+        out=tmp_path,
+    )
+    assert _epochs_after(stage, plan) == later
+    stage.name = "other"
+    assert _epochs_after(stage, plan) == 0

@@ -12,20 +12,29 @@ import torch
 import yaml
 
 from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import AugmentConfig
+from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.joined import MixedRecord, join
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.datasets.own import open_own
+from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.inference.reading import normalised, normaliser_for
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
+from amvnet.sensors.normalise import Normaliser
 from amvnet.sensors.record import AS_IS_KEY, SENSOR_KEY
 from amvnet.training.augment import mix
-from amvnet.training.plan import open_parts, sized_by_init, without_weight_averaging
+from amvnet.training.loaders import ScanSet
+from amvnet.training.plan import (
+    open_for_training,
+    open_parts,
+    sized_by_init,
+    without_weight_averaging,
+)
 from amvnet.training.sensor_record import sensor_record
-from amvnet.weights.file import load, save
+from amvnet.weights.file import Weights, load, save
 
 from fixtures.commands import refusal, run_cli
 from fixtures.own_scans import make_own_scans
@@ -87,6 +96,23 @@ def test_a_mixed_scan_is_read_from_its_own_dataset(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scan.labels, expected.labels)
 
 
+def test_scans_that_are_mixed_into_others_are_of_the_same_epoch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans = joined(tmp_path, 0.5)
+    epochs = []
+    at_epoch = scans.dataset.at_epoch
+
+    def record_epoch(record: ScanRecord, epoch: int) -> ScanRecord:
+        epochs.append(epoch)
+        return at_epoch(record, epoch)
+
+    monkeypatch.setattr(scans.dataset, "at_epoch", record_epoch)
+    augmented = AugmentConfig(mix=1, laser_mix=1, paste=1)
+    assert len(ScanSet(scans.dataset, scans.train, augmented)[5, 0])
+    assert epochs == [5] * 4  # the scan, and one for each way to mix
+
+
 def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: Path) -> None:
     a = open_dataset(str(make_streets(tmp_path / "a")))
     scans = TrainingScans(a, a.records(["00"]), [])
@@ -126,6 +152,27 @@ def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_f
         batch = PointBatch.of([scans.dataset.read(record)])
         as_is = PointBatch.of([open_dataset(str(streets)).read(record.original)])
         assert torch.equal(view.rows(batch), view.rows(as_is))
+
+
+def test_ones_own_scans_are_brought_to_the_initial_weights_rather_than_to_earlier_ones(
+    tmp_path: Path, own_file: Path
+) -> None:
+    by_height = {}
+    for height in (1.0, 2.0):
+        record = {"range_net": {SENSOR_KEY: {"height": height}}}
+        by_height[height] = replace(fresh_weights(), training=record)
+    recipe = sized_by_init(load_recipe("finetune"), by_height[2.0])
+
+    def target(init: Weights | None) -> float | None:
+        dataset = open_for_training(str(own_file), recipe, tmp_path / "run", init)
+        assert isinstance(dataset, OwnScans)
+        assert isinstance(dataset.normalise, Normaliser)
+        assert dataset.normalise.expected is not None
+        return dataset.normalise.expected.sensor.height
+
+    save(by_height[1.0], tmp_path / "run/weights.safetensors")
+    assert target(None) == 1.0
+    assert target(by_height[2.0]) == 2.0
 
 
 def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) -> None:

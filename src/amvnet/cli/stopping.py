@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -52,6 +53,8 @@ class Stop:
             # An exception while torch is imported would abort the process within C++ code.
             if is_second or _is_importing(frame):
                 self.end()
+            # In a destructor, the interruption is printed with a traceback and lost.
+            sys.unraisablehook = _ignore
             deadline = threading.Timer(SECONDS_TO_END, self._insist)
             deadline.daemon = True
             deadline.start()
@@ -83,6 +86,10 @@ class Stop:
         console.show_cursor()  # because a progress bar hides it
         stdout.flush()
         os._exit(self.exit_code)
+
+
+def _ignore(unraisable: object) -> None:
+    """Print nothing about an exception that Python cannot raise."""
 
 
 def _is_importing(frame: FrameType | None) -> bool:
