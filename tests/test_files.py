@@ -8,7 +8,7 @@ import os
 import stat
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amvnet import files
+from amvnet.cli.commands import demo
 from amvnet.data.class_maps import class_map
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud
@@ -37,73 +38,10 @@ from lidarstreets.layouts import write_whole
 
 from fixtures.commands import fails, refusal, run_cli
 from fixtures.datasets import MAKERS, make_nuscenes
-from fixtures.tiny import fresh_weights, street, without, write_recipe
+from fixtures.surroundings import LINKS, NAMES, PRECIOUS, REFUSED, contents_outside, surroundings
+from fixtures.tiny import fake_drive, fresh_weights, street, without, write_recipe
 
 COUNT = 7  # points of a scan
-PRECIOUS = b"hours of work"
-VICTIMS = ("precious_lidarseg.bin", "precious.label", "precious.npy", "precious.npz", "precious")
-
-# Names that data may have. The output folder is BASE/out, and the victims are in BASE/victim.
-REFUSED = (
-    "../victim/precious",
-    "../../../victim/precious",
-    "a/../../victim/precious",
-    "BASE/victim/precious",
-    "a/../b",
-    "a\nb",
-    "\x1b[2J",
-    "\x00",
-    "\x9b1m",
-    "x" * 256,
-    "ä" * 200,
-    "\ud800",
-    "linked/precious",
-    "a/linked/precious",
-)
-ODD = ("", ".", "..", "/", "a/..", "a\\..\\precious", "C:\\precious", "linked", "\udcff")
-NAMES = st.sampled_from([*REFUSED, *ODD]) | st.text(max_size=8) | st.text("./\\a", max_size=8)
-LINKS = st.sampled_from(
-    ["sequences", "sequences/08", "lidarseg", "lidarseg/mini_val", "a", "linked", "a/linked"]
-)
-
-
-@contextmanager
-def surroundings(
-    *links: str, make: Callable[[Path], object] = lambda folder: None
-) -> Iterator[Path]:
-    """Yield a folder with victims and an output folder; only the latter may change in the block.
-
-    Args:
-        links: paths in the output folder that link to the folder of the victims.
-        make: makes the data, given their folder.
-    """
-    with tempfile.TemporaryDirectory() as name:
-        base = Path(name)
-        (base / "victim").mkdir()
-        for victim in VICTIMS:
-            (base / "victim" / victim).write_bytes(PRECIOUS)
-        for link in links:
-            path = base / "out" / link
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.symlink_to(base / "victim")
-        make(base / "data")
-
-        before = contents_outside(base)
-        yield base
-        assert contents_outside(base) == before
-
-
-def contents_outside(base: Path) -> dict[str, bytes | None]:
-    """Return the contents of all files outside the output folder; None for folders."""
-    contents: dict[str, bytes | None] = {}
-    for folder, folders, names in os.walk(base):
-        if Path(folder) == base:
-            folders[:] = [name for name in folders if name != "out"]
-        contents[folder] = None
-        for name in names:
-            path = Path(folder) / name
-            contents[str(path)] = path.read_bytes()
-    return contents
 
 
 def label(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
@@ -307,6 +245,12 @@ WRITERS = (
     "rank {base}/data/own.yaml --weights {base}/data/w.safetensors --out {base}/out/r.csv",
     "evaluate {base}/data/own.yaml --weights {base}/data/w.safetensors --pictures {base}/out",
     "predict {base}/data/own.yaml --weights {base}/data/w.safetensors --out {base}/out --scores",
+    "fuse {base}/data/own.yaml --scores-a {base}/data/scores --scores-b {base}/data/scores"
+    " --out {base}/out",
+    "submit nuscenes:{base}/data/nuscenes --predictions {base}/data/predictions --split val"
+    " --out {base}/out/e.zip",
+    "simulate {base}/out --scans 1",
+    "demo --weights {base}/data/kitti.safetensors --out {base}/out",
 )
 
 
@@ -318,6 +262,8 @@ def make_hostile(folder: Path) -> None:
         points, raw = street(0, 400)
         np.save(folder / site / "%2e%2e%2fx.npy", points)
         np.save(folder / site / "%2e%2e%2fx_labels.npy", raw % 5 + 1)
+        (folder / "scores" / site).mkdir(parents=True)
+        np.save(folder / "scores" / site / "%2e%2e%2fx.npy", np.full((400, 5), 0.2))
     description = {
         "name": HOSTILE,
         "classes": classes,
@@ -331,14 +277,33 @@ def make_hostile(folder: Path) -> None:
     weights = replace(fresh_weights(taxonomy), sensor=HOSTILE)
     save(weights, folder / "w.safetensors")
     save(without(weights, "range_net", "point_head"), folder / "bev.safetensors")
+    save(replace(fresh_weights(), sensor=HOSTILE), folder / "kitti.safetensors")
+
+    make_nuscenes(folder / "nuscenes")
+    set_token(folder / "nuscenes", "%2e%2e%2f..x $(id) </script>".replace("/", ""))
+    nuscenes = open_dataset(f"nuscenes:{folder / 'nuscenes'}")
+    for record in nuscenes.records(nuscenes.sequences("all")):
+        ids = np.ones(len(nuscenes.read(record)), np.uint8)
+        nuscenes.write_prediction(record, folder / "predictions", ids)
+    (folder / "temporary").mkdir()
 
 
 @pytest.mark.parametrize("command", WRITERS, ids=lambda command: command.split()[0])
-def test_names_in_the_data_do_not_lead_a_command_elsewhere(command: str) -> None:
-    """Nor does it change what it reads, or leave other files than those of the output."""
+def test_names_in_the_data_do_not_lead_a_command_elsewhere(
+    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Nor does it change what it reads, or leave files anywhere but in its output folder."""
     if command.startswith("export"):
         pytest.importorskip("onnxscript")
+    if command.startswith(("simulate", "demo")):
+        pytest.importorskip("embreex")
+        monkeypatch.setattr(demo, "SEQUENCES", 1)
+        monkeypatch.setattr(demo, "SCANS", 1)
+        drive = partial(fake_drive, "hdl64e")
+        monkeypatch.setattr("lidarstreets.writing.drive_street", lambda _, *rest: drive(*rest))
     with surroundings(make=make_hostile) as base:
+        monkeypatch.setattr(tempfile, "tempdir", str(base / "data/temporary"))
+        monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))  # torch keeps its cache
         code, error = run_cli(*command.format(base=base).split())
         assert code in (0, 2), error
         assert code == 0 or "Traceback" not in error

@@ -117,10 +117,26 @@ def simulate(
         progress(done, scans * sequences)
 
     # The layout's tables cover all sequences in the folder, including sequences of earlier calls.
-    markers = sorted((out / MARKER_FOLDER).glob("*.json"))
-    rows = [json.loads(path.read_text())["rows"] for path in markers]
+    rows = []
+    for path in sorted((out / MARKER_FOLDER).glob("*.json")):
+        marker = _read_marker(path)
+        if marker is None:
+            raise SimulationError(
+                f"{path}: expected the record of a complete sequence, found a broken file; "
+                f"simulate sequence {path.stem} again, or choose another folder"
+            )
+        rows.append(marker["rows"])
     layout.complete(out, rows)
     return out
+
+
+def _read_marker(path: Path) -> dict[str, Any] | None:
+    """Return the content of a file in `MARKER_FOLDER`; None if it is broken, as by a power cut."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) and isinstance(content.get("rows"), dict) else None
 
 
 def _is_complete(sequence: Sequence) -> bool:
@@ -129,10 +145,10 @@ def _is_complete(sequence: Sequence) -> bool:
     Raises:
         SimulationError: if it did so with other settings.
     """
-    if not sequence.marker.is_file():
+    settings = _read_marker(sequence.marker) if sequence.marker.is_file() else None
+    if settings is None:
         return False
 
-    settings = json.loads(sequence.marker.read_text())
     del settings["rows"]
     if settings != sequence.settings:
         raise SimulationError(

@@ -452,6 +452,7 @@ def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
     fails(lambda: read_scan_labels(site / "a.half.npy", 60, SEMANTICKITTI), "whole numbers")
     for values, *words in (
         (np.full(60, 2.0**40), "32 bits"),
+        (np.full(60, -(2.0**40)), "32 bits"),
         (np.where(np.arange(60) < 7, 0.5, 1), "whole numbers", "found 0.5 (7 of 60"),
         (np.where(np.arange(60) < 7, np.inf, 1), "whole numbers", "found inf (7 of 60"),
         (np.stack([RAW, RAW], axis=1), "2 columns", "field: 1"),

@@ -10,7 +10,7 @@ import pytest
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.find import find_scans, list_scans, read_cloud
-from amvnet.data.formats.rows import RowLayout, are_rings, parse_layout
+from amvnet.data.formats.rows import NAMES, RowLayout, are_rings, name_columns, parse_layout
 from amvnet.data.formats.text import find_table
 
 from fixtures.commands import fails
@@ -378,6 +378,14 @@ def test_a_long_name_of_a_column_takes_little_time() -> None:
     start = time.process_time()
     assert find_table(f"{line}\n1,2,3\n4,5,6\n".encode()) is not None
     assert time.process_time() - start < 2  # seconds; it was half a minute
+
+
+def test_colours_after_the_intensity_are_no_rings() -> None:
+    rng = np.random.default_rng(0)
+    scan = np.column_stack([rng.normal(0, 10, (5000, 3)), rng.random(5000)])
+    colors = rng.integers(0, 256, (5000, 3))  # each value is equally frequent, as lasers are
+    assert are_rings(scan[:, :3], colors[:, 0])
+    assert name_columns(np.column_stack([scan, colors])) == (*NAMES[:4], "_", "_", "_")
 
 
 def test_equally_frequent_labels_with_gaps_are_no_rings() -> None:

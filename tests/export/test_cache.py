@@ -90,11 +90,13 @@ def test_networks_are_exported_once_for_each_weights_and_precision(exports: Expo
     assert exports.count == 1
 
     other = fresh_weights(seed=8)
-    folders = {filled(), filled(other)}
-    assert exports.count == 2
-    cached(int8="simulated")
+    view = replace(WEIGHTS.model.range_view, width=128)  # the same parameters, another graph
+    wider = replace(WEIGHTS, model=replace(WEIGHTS.model, range_view=view))
+    folders = {filled(), filled(other), filled(wider)}
     assert exports.count == 3
-    assert len(folders) == 2
+    cached(int8="simulated")
+    assert exports.count == 4
+    assert len(folders) == 3
     assert {path.name for path in user_cache().glob("onnx/*")} > {each.name for each in folders}
 
 

@@ -21,8 +21,10 @@ import pytest
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.export import int8 as int8_export
 from amvnet.export import onnx as onnx_export
+from amvnet.export.int8 import calibration_scans
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY
 from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails, files, succeed
@@ -199,6 +201,15 @@ def check_refused(weights: Weights, int8: str, folder: Path, word: str) -> None:
 
 def test_calibrating_without_a_folder_is_one_line(weights: Weights, tmp_path: Path) -> None:
     check_refused(weights, str(tmp_path / "missing"), tmp_path, "expected")
+
+
+def test_calibrating_scans_have_the_intensities_that_the_networks_get(scans: Path) -> None:
+    quantiles = (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist()
+    record = {MATCHED_KEY: True, QUANTILES_KEY: quantiles}
+    weights = replace(fresh_weights(), training={"range_net": record, "polar_net": record})
+    for scan in calibration_scans(str(scans), weights):
+        found = np.quantile(scan.points[scan.valid, 3], PROBABILITIES)
+        np.testing.assert_allclose(found, quantiles, atol=0.02)
 
 
 def test_calibrating_without_scans_is_one_line(weights: Weights, tmp_path: Path) -> None:

@@ -31,7 +31,13 @@ from amvnet.models.methods import BOTH_NETWORKS, MethodName
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import DESCRIPTION, OnnxSegmenter, pool
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY, SIMULATED_QUANTILES
+from amvnet.sensors.intensity import (
+    MATCHED_KEY,
+    PROBABILITIES,
+    QUANTILES_KEY,
+    SIMULATED_QUANTILES,
+    trained_intensity,
+)
 from amvnet.weights.file import Weights, save
 
 from fixtures.commands import (
@@ -271,6 +277,12 @@ from pathlib import Path
 from amvnet.onnx_runner import open_session
 open_session(Path("a"), model.SerializeToString(), ["CPUExecutionProvider"])
 """
+
+
+def test_intensities_that_are_not_matched_are_not_in_the_description() -> None:
+    weights = replace(fresh_weights(), sensor="hdl64e")
+    assert trained_intensity(weights.training, weights.sensor) is not None
+    assert describe_export(weights, "amvnet", {})["intensity"] is None
 
 
 def test_onnx_runtime_reports_nothing_and_writes_nothing(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ import pytest
 from amvnet.data.datasets.open import open_dataset
 from lidarstreets import SimulationError, simulate, writing
 
+from fixtures.tiny import fake_drive
+
 pytest.importorskip("embreex")
 
 LINUX = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
@@ -142,6 +144,22 @@ def test_a_complete_simulation_is_not_written_again(
     before = digests(nuscenes)
     simulate(nuscenes, sensor="hdl32e", sequences=2, scans=3, seed=2)
     assert digests(nuscenes) == before
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"seed": 3}', "[" * 100_000, "\x00" * 9])
+def test_a_sequence_whose_record_is_broken_is_written_again(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power cut may leave an empty file."""
+    monkeypatch.setattr(writing, "drive_street", lambda _, *rest: fake_drive("hdl64e", *rest))
+    settings: dict[str, Any] = {"scans": 1, "seed": 3}
+    simulate(tmp_path, sequences=2, **settings)
+    before = digests(tmp_path)
+    (tmp_path / ".simulation/0001.json").write_text(content)
+    with pytest.raises(SimulationError, match=r"0001\.json: expected .* simulate sequence 0001"):
+        simulate(tmp_path, sequences=1, **settings)
+    simulate(tmp_path, sequences=2, **settings)
+    assert digests(tmp_path) == before
 
 
 @pytest.mark.parametrize("other", [{"seed": 3}, {"scans": 4}, {"sensor": "hdl64e"}])

@@ -160,6 +160,9 @@ def test_a_deeper_network_begins_as_the_shallower_one() -> None:
     assert deeper.model.range_net.blocks == more
     assert deeper.parts == weights.parts
     assert deeper.digest("polar_net") == weights.digest("polar_net")
+    assert "range_net" in weights.metrics
+    assert "range_net" not in deeper.metrics  # nobody has measured the deeper network
+    assert set(deeper.training) == set(weights.training) - {"range_net"}
 
     # Only the leak of the added activations differs.
     points, _ = street(0)
