@@ -235,7 +235,7 @@ def read_yaml(path: Path, content: str) -> Any:
     except OSError as error:
         raise InputError(f"{expected}, found {error.strerror}; check the path") from None
     except UnicodeDecodeError:
-        raise InputError(f"{expected}, found bytes that are not text; give another file") from None
+        raise InputError(f"{expected}, found text that is not UTF-8; save it as UTF-8") from None
     raise InputError(f"{expected} of at most {LARGEST_YAML} bytes, found {size}; give another file")
 
 

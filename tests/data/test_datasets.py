@@ -313,12 +313,20 @@ def test_opening_names_what_it_looked_for(tmp_path: Path) -> None:
     fails(lambda: open_dataset(str(tmp_path / "no")), tmp_path / "no")
     fails(lambda: open_dataset(f"nuscenes:{tmp_path / 'no'}"), tmp_path / "no")
     fails(lambda: open_dataset(str(tmp_path)), tmp_path, "neither", "velodyne", "sample_data.json")
+    fails(lambda: open_dataset(str(tmp_path)), "describe the scans in a YAML file")
     fails(lambda: open_dataset(f"semantickitti:{tmp_path}"), tmp_path, "velodyne")
     fails(lambda: open_dataset(f"nuscenes:{tmp_path}"), tmp_path, "v1.0-")
 
     make_semantickitti(tmp_path)
     fails(lambda: open_dataset(f"semantickitti:{tmp_path}@v1.0-mini"), tmp_path, "v1.0-mini")
     assert open_dataset(str(tmp_path)).taxonomy is SEMANTICKITTI
+    inside = tmp_path / "sequences" / "08"
+    fails(lambda: open_dataset(str(inside)), "whole dataset", str(tmp_path.absolute()))
+
+
+def test_a_folder_with_a_description_names_the_yaml_file(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").touch()
+    fails(lambda: open_dataset(str(tmp_path)), "give the YAML file", tmp_path / "mine.yaml")
 
 
 # --- real data ---

@@ -295,6 +295,17 @@ def test_label_files_are_no_scans_for_weights_of_other_classes_either(tmp_path: 
     assert data.read(record).labels is None
 
 
+def test_predictions_of_other_ids_are_told_which_to_write(site: Path) -> None:
+    np.save(site / "a.npy", np.column_stack([some_points()[:, :3], RAW]))
+    data = open_own(describe(site.parent, labels={"field": 3}))
+    (record,) = data.records(["site"])
+    path = site.parent / "predictions" / record.prediction
+    path.parent.mkdir(parents=True)
+    np.resize(np.array([0, 1, 2], np.uint32), data.count_points(record)).tofile(path)
+    call = partial(data.read_prediction, record, site.parent / "predictions")
+    fails(call, path, "(3, 7), found 0, 1, 2", "write the predictions with these ids")
+
+
 def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> None:
     np.save(site / "a.npy", some_points())
     data = open_own(describe(tmp_path))
@@ -360,6 +371,17 @@ def test_wrong_columns_in_the_file_are_called_by_its_keys(site: Path) -> None:
 def test_a_typo_in_a_key_follows_the_name_of_the_file(site: Path) -> None:
     path = describe(site.parent, clases={"a": 1})
     fails(lambda: open_own(path), f"{path}: expected keys of")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_a_file_of_another_encoding_is_told_to_be_utf_8(site: Path, encoding: str) -> None:
+    np.save(site / "a.npy", some_points())
+    path = describe(site.parent)
+    text = f"# schön\r\n{path.read_text()}"
+    path.write_bytes(text.encode(encoding))
+    fails(lambda: open_own(path), path, "save it as UTF-8")
+    path.write_bytes(text.encode("utf-8-sig"))
+    assert open_own(path).sequences("all") == ("site",)
 
 
 @pytest.mark.parametrize(

@@ -125,8 +125,11 @@ class Taxonomy:
                 table[raw_id] = train_id
         return table
 
-    def to_train(self, raw: NDArray[np.integer]) -> NDArray[np.uint8]:
+    def to_train(self, raw: NDArray[np.integer], advice: str | None = None) -> NDArray[np.uint8]:
         """Return the train ids (N,) uint8 of raw ids (N,); only their lower 16 bits count.
+
+        Args:
+            advice: what the user can do about an unknown raw id; default: advice about labels.
 
         Raises:
             InputError: if a raw id is not in the table.
@@ -142,12 +145,12 @@ class Taxonomy:
 
             if raw_ids.max() <= self.size:
                 listed += " (train ids, it seems)"
-            advice = "write its raw ids, or describe your own in a YAML file (docs/own_data.md)"
+            usual = "write its raw ids, or describe your own in a YAML file (docs/own_data.md)"
             if self.name not in TAXONOMIES:
-                advice = "add them to a class or to ignored, or write ignored: rest"
+                usual = "add them to a class or to ignored, or write ignored: rest"
             raise InputError(
                 f"expected the raw ids of {self.name} "
-                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; {advice}"
+                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; {advice or usual}"
             )
         checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
         return checked

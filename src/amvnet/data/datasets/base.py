@@ -192,7 +192,7 @@ class Dataset(ABC):
         """
         path = Path(folder) / record.prediction
         raw = read_ids(path, _id_type(path), self.count_points(record))
-        return train_ids(path, raw, self.taxonomy)
+        return train_ids(path, raw, self.taxonomy, "write the predictions with these ids")
 
     def write_prediction(
         self,

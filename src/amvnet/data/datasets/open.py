@@ -17,6 +17,7 @@ from amvnet.errors import InputError
 Reader = type[SemanticKitti] | type[NuScenes]
 
 READERS: dict[str, Reader] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
+DEEPEST = 3  # the scans of SemanticKITTI are in a folder this far below the dataset's
 OWN = "files"  # prefix of the YAML file of a user's own scans
 # Prefixes of simulated streets, each with the name of its sensor.
 SIMULATED = {f"simulated-{sensor}": sensor for sensor in CLASSES_BY_SENSOR}
@@ -111,9 +112,22 @@ def _guess_reader(path: Path) -> Reader:
     readers = _readers_of(path)
     if len(readers) == 1:
         return readers[0]
-    found = "both" if readers else "neither"
-    choices = " or ".join(f"{kind}:PATH" for kind in READERS)
+    if readers:
+        found = "both; write " + " or ".join(f"{kind}:PATH" for kind in READERS)
+    else:
+        found = f"neither{_or_description(path, _advice_for(path))}"
     raise InputError(
         f"{path}: expected either sequences/XX/velodyne (SemanticKITTI) or v1.0-*/sample_data.json "
-        f"(nuScenes), found {found}{_or_description(path, f'write {choices}')}"
+        f"(nuScenes), found {found}"
     )
+
+
+def _advice_for(path: Path) -> str:
+    """Return what a user can do about a folder that has the layout of no dataset."""
+    for parent in list(path.absolute().parents)[:DEEPEST]:
+        if _readers_of(parent):
+            return f"give the folder of the whole dataset, {parent}"
+    described = [file for file in sorted(path.iterdir()) if file.suffix.lower() in ENDINGS]
+    if described:
+        return f"give the YAML file that describes the scans, such as {described[0]}"
+    return "describe the scans in a YAML file (docs/own_data.md)"

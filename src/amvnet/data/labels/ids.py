@@ -93,20 +93,23 @@ def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> Non
     )
 
 
-def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarray:
+def train_ids(
+    name: Path | str, raw: np.ndarray, taxonomy: Taxonomy, advice: str | None = None
+) -> np.ndarray:
     """Return the (N,) uint8 train ids of (N,) raw ids; an error names the likely mistake.
 
     Args:
         name: the beginning of the message.
         raw: (N,) raw ids.
         taxonomy: the classes.
+        advice: as `Taxonomy.to_train` takes it.
 
     Raises:
         InputError: if an id is no raw id of the taxonomy, or all ids look like float32 or
             big-endian ids.
     """
     with errors_of(name):
-        return taxonomy.to_train(check_bits(name, raw))
+        return taxonomy.to_train(check_bits(name, raw), advice)
 
 
 def check_bits(name: Path | str, raw: np.ndarray) -> np.ndarray:
