@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from amvnet.data.formats.registry import read_file
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.fleet.labelling import IS_FATAL, LabelScans, MeasureSensors, statistics
 from amvnet.fleet.manifest import list_scans
-from amvnet.fleet.results import results_schema
+from amvnet.fleet.results import Results, results_schema
 from amvnet.fleet.storage import Place
 from amvnet.inference.listing import InputScan
 from amvnet.inference.pipeline import Segment
@@ -31,6 +34,7 @@ from amvnet.weights.file import load
 from fixtures.commands import fails, succeed
 from fixtures.s3_server import Bucket
 from fixtures.scan_writers import write_ply
+from fixtures.surroundings import LINKS, NAMES, surroundings
 from fixtures.tiny import street
 
 NOWHERE = Place.of("/an/output/folder/elsewhere")
@@ -221,6 +225,30 @@ def test_scans_beside_a_fault_are_normalised_as_their_drive(
     assert [row["error"] is None for row in rows] == [True, True, False, True]
     for name in ("0.label", "1.label", "3.label"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+@settings(deadline=None, max_examples=50)
+@given(name=NAMES, drive=NAMES, kind=st.sampled_from(["label", "npy", "ply"]), link=LINKS)
+def test_names_in_a_manifest_write_nothing_elsewhere(
+    labelling: LabellingRequest, name: str, drive: str, kind: str, link: str
+) -> None:
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        street(0, 200)[0].tofile(folder / "a.bin")
+
+    with surroundings(link, make=make) as base:
+        out = str(base / "out")
+        request = replace(labelling, kind=kind, scores=True, uncertain=True)
+        row = {
+            "path": f"{base}/data/a.bin",
+            "name": name.replace("BASE", str(base)),
+            "drive": drive,
+        }
+        with suppress(UnicodeEncodeError):  # no table can hold such a name
+            block = pa.Table.from_pylist([row])
+            LabelScans(request, out)(block)
+            results = Results(Place.of(f"{out}/new"), request)
+            results.add_drives(MeasureSensors(request)(block))
 
 
 def test_what_is_no_scan_file_is_a_broken_scan_in_one_line(

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -316,6 +317,19 @@ def test_two_scans_that_write_one_file_are_refused(fleet: Path, tmp_path: Path) 
     fails(lambda: run.plan(scans_of("b", "3", "2", "3")), "found 3 twice")
 
 
+def test_only_labels_of_the_scans_of_this_run_are_counted(fleet: Path, tmp_path: Path) -> None:
+    run = run_in(fleet, tmp_path)
+    rows = []
+    for name in ("1", "2", "3"):
+        row = {"scan": name, "drive": "a", "path": f"{name}.bin", "labels": f"{name}.label"}
+        rows.append(row | {"points": 9, "uncertain": 0.0})
+        (tmp_path / f"{name}.label").write_bytes(bytes(36))
+    run.results.add(pa.Table.from_pylist(rows, results_schema(run.request.taxonomy)))
+    run.results.flush()
+    run.plan(scans_of("a", "1", "3"))
+    assert run.finish() == 2
+
+
 def test_scans_of_one_drive_follow_one_another_with_its_estimates() -> None:
     scans = pa.concat_tables([scans_of("a", "1", "2"), scans_of("b", "3"), scans_of("a", "4")])
     rows = pipeline._with_estimates(scans, {"a": "A", "b": "B"}).to_pylist()
@@ -422,9 +436,11 @@ class Reluctant(Mortal):
 
 
 def test_a_ray_that_starts_here_reports_nothing_of_its_use() -> None:
-    from ray._private.usage import usage_lib
-
-    assert not usage_lib.usage_stats_enabled()
+    try:
+        usage = import_module("ray._common.usage.usage_lib")
+    except ModuleNotFoundError:  # its place in earlier versions
+        usage = import_module("ray._private.usage.usage_lib")
+    assert not usage.usage_stats_enabled()
 
 
 def test_workers_that_cannot_start_are_one_line(

@@ -14,13 +14,16 @@ from torch.nn import functional as F
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import ModelConfig, NetworkTraining, Recipe, TrainingConfig
+from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import simulated_intensity
+from amvnet.training.loaders import ScanSet
 from amvnet.training.losses import Targets, dice, lovasz_softmax
-from amvnet.training.networks import PolarStage, make_stage
+from amvnet.training.networks import PolarStage, make_loaders, make_stage
 from amvnet.training.plan import Plan
 
 from fixtures.tiny import MODEL, street
@@ -114,3 +117,24 @@ def test_the_loss_of_a_stage_equals_its_formula_with_all_weights(
             targets = Targets.of(target, torch.zeros_like(target), (1, 19))
             losses.append(cross_entropy + 0.3 * region_loss(logits.softmax(1), targets))
         torch.testing.assert_close(made.loss(scored), torch.stack(losses).mean())
+
+
+def test_validation_scans_are_read_like_training_scans_and_not_augmented() -> None:
+    view = replace(MODEL_CONFIG.range_view, rows="laser")
+    recipe = Recipe(model=replace(MODEL_CONFIG, range_view=view))
+    dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
+    records = []
+    for name in ("a", "b"):
+        path = Path(f"{name}.bin")
+        records.append(ScanRecord(name, "00", path, None, prediction=f"{name}.label"))
+    plan = Plan(recipe, TrainingScans(dataset, records[:1], records[1:]), Path("run"))
+    intensity = simulated_intensity("hdl64e")
+
+    train, val = make_loaders(plan, CONFIG, intensity)
+    assert val is not None
+    for loader, is_augmented in ((train, True), (val, False)):
+        scans = loader.dataset
+        assert isinstance(scans, ScanSet)
+        assert scans.lasers == view.height
+        assert scans.intensity is intensity
+        assert (scans.augment is not None) == is_augmented
