@@ -322,6 +322,19 @@ def test_a_finished_run_makes_only_labels_that_are_gone(
     assert changed == {"000003.label"}
 
 
+def test_a_run_that_repeats_some_scans_leaves_the_others_to_resume(
+    world: Path, whole: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    succeed(f"predict {world}/scans/000003.bin --weights {world}/{WEIGHTS} --out {out} --overwrite")
+    times = times_of(out)
+    succeed(predict(world, out, "--resume"))
+    check_same(out, whole)
+    changed = {name for name, time in times_of(out).items() if time != times[name]}
+    assert changed <= {"000003.label"}  # its folder is another recording if it is alone
+
+
 def test_a_scan_that_lacks_one_of_its_files_is_segmented_again(world: Path, tmp_path: Path) -> None:
     scan = shutil.copy(world / "scans/000003.bin", tmp_path)
     command = f"predict {scan} --weights {world}/{WEIGHTS} --scores --uncertain --resume"

@@ -137,9 +137,10 @@ class Pipeline:
         check_output(self.scans, self.output, earlier)
         done = self._still_done(earlier)
         remaining = [scan for scan in self.scans if _key(scan) not in done]
+        kept = done if self.output.resume else self._entries_of_others(settings)
 
         faults = []
-        with Journal(folder, settings, done.values()) as journal:
+        with Journal(folder, settings, kept.values()) as journal:
             for count, outcome in enumerate(self.stream(remaining, self.write_or_explain)):
                 progress(count, len(remaining))
                 if isinstance(outcome, Entry):
@@ -153,6 +154,19 @@ class Pipeline:
             with suppress(OSError):  # the folder is empty only if all scans were broken
                 folder.rmdir()
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
+
+    def _entries_of_others(self, settings: Mapping[str, Any]) -> dict[str, Entry]:
+        """Return the entries of an earlier run with equal settings that this run does not replace.
+
+        They stay in the journal, so that a run over all scans can be resumed later.
+        """
+        try:
+            earlier = read_journals(self.output.folder, settings)
+        except InputError:  # it had other settings
+            return {}
+        for scan in self.scans:
+            earlier.pop(_key(scan), None)
+        return earlier
 
     def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return the entries of an earlier run whose scans need not be segmented again.

@@ -93,12 +93,11 @@ class ScoreFolder:
         scores = self._load(path)
 
         if scores.shape != (len(scan), classes):
-            has_other_column = scores.shape[-1:] == (classes + 1,)
-            advice = (
-                "drop the column of points without a class"
-                if has_other_column
-                else "give the scores of this scan"
-            )
+            advice = "give the scores of this scan"
+            if scores.shape == (classes, len(scan)):
+                advice = "transpose them"
+            elif scores.shape[-1:] == (classes + 1,):
+                advice = "drop the column of points without a class"
             raise InputError(
                 f"{path}: expected scores of shape ({len(scan)}, {classes}), one row per point and "
                 f"one column per class, found {scores.shape}; {advice}"
