@@ -393,15 +393,16 @@ def connect(address: str | None = None) -> None:
             f"--address: expected an address such as auto or ray://HOST:10001, found {address!r}; "
             "leave it out to start Ray on this machine"
         )
+
+    warnings.filterwarnings("ignore", module=r"ray\.")
+    # Without max_task_retries, Ray Data would try a scan that ends its workers for ever.
+    warnings.filterwarnings("ignore", message="`ray_remote_args` is deprecated")
     if ray.is_initialized():
         return
     options: dict[str, Any] = {"address": address or "local"}
     if address is None:
         options |= {"include_dashboard": False, "object_store_memory": OBJECT_STORE}
 
-    warnings.filterwarnings("ignore", module=r"ray\.")
-    # Without max_task_retries, Ray Data would try a scan that ends its workers for ever.
-    warnings.filterwarnings("ignore", message="`ray_remote_args` is deprecated")
     try:
         with _own_signals():
             ray.init(**options, log_to_driver=False, logging_level=logging.CRITICAL)
