@@ -255,6 +255,13 @@ def test_the_rest_of_the_ids_can_be_ignored(site: Path, ignored: Any) -> None:
     assert len(Taxonomy.from_dict(taxonomy.to_dict()).raw_to_train) < 6
 
 
+def test_ids_before_names_are_told_to_come_after_them(site: Path) -> None:
+    np.save(site / "a.npy", some_points())
+    path = site.parent / "own.yaml"
+    path.write_text("classes: {0: ground, 1: plant}\nscans: '*/*.npy'\n")
+    fails(lambda: open_own(path), path, "found 0: 'ground'", "write the name first")
+
+
 @pytest.mark.parametrize("text", ["{no: 1, b: 2}", "{1: 1, b: 2}", "{a: 1, b: 2, 'a': 3}"])
 def test_names_that_yaml_changes_or_drops_are_refused(site: Path, text: str) -> None:
     np.save(site / "a.npy", some_points())

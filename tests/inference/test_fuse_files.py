@@ -243,6 +243,7 @@ def broken_scores(good: np.ndarray) -> dict[str, BrokenScores]:
         "one point less": BrokenScores(good[1:], ("(500, 19)", "(499, 19)")),
         "a column more": BrokenScores(column_more, ("(500, 20)", "drop the column")),
         "transposed": BrokenScores(good.T, ("(19, 500)", "transpose them")),
+        "other classes": BrokenScores(good[:, :5], ("(500, 5)", "the classes of the scores")),
         "a single number": BrokenScores(np.float32(1), ("()",)),
         "integers": BrokenScores(integers, ("uint8",)),
         "objects": BrokenScores(np.full((500, 19), None), ("broken",)),

@@ -248,6 +248,11 @@ def class_entries(classes: Any, key: str, example: str) -> dict[str, dict[str, A
 
     entries = {}
     for train_id, (title, entry) in enumerate(classes.items(), start=1):
+        if type(title) is int and isinstance(entry, str):  # as in the files of other projects
+            raise InputError(
+                f"classes: expected entries such as {example}, found {title}: {shown(entry)}; "
+                "write the name first"
+            )
         if not isinstance(title, str):  # YAML reads no, off, on and yes without quotes as booleans
             raise InputError(
                 f"classes: expected texts as names, found the value {shown(title)}, as YAML reads "

@@ -98,6 +98,8 @@ class ScoreFolder:
                 advice = "transpose them"
             elif scores.shape[-1:] == (classes + 1,):
                 advice = "drop the column of points without a class"
+            elif scores.ndim == 2 and len(scores) == len(scan):
+                advice = "give a dataset or a YAML file that has the classes of the scores"
             raise InputError(
                 f"{path}: expected scores of shape ({len(scan)}, {classes}), one row per point and "
                 f"one column per class, found {scores.shape}; {advice}"
