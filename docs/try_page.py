@@ -27,7 +27,8 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "docs" / "try"
 PATTERNS = ("*.html", "*.css", "*.js", "*/*.js")  # the files of SOURCE; node_modules lies deeper
 RUNTIME = SOURCE / "node_modules" / "onnxruntime-web" / "dist"
-# ONNX Runtime Web for the CPU and, with jspi, for GPUs.
+# ONNX Runtime Web for the CPU and, with jspi, for GPUs. Some hosts do not know that .mjs is
+# JavaScript, so the page has these files as .js.
 RUNTIME_SCRIPTS = (
     "ort.wasm.min.mjs",
     "ort-wasm-simd-threaded.mjs",
@@ -68,7 +69,7 @@ def build(out: Path) -> None:
         for path in SOURCE.glob(pattern):
             copy(path, out / path.relative_to(SOURCE))
     for name in RUNTIME_SCRIPTS:
-        copy(RUNTIME / name, out / "ort" / name)
+        copy(RUNTIME / name, (out / "ort" / name).with_suffix(".js"))
     for name in RUNTIME_BINARIES:
         packed = gzip.compress((RUNTIME / name).read_bytes(), mtime=0)
         (out / "ort" / f"{name}.gz").write_bytes(packed)

@@ -10,7 +10,7 @@ let models = [], file = null, asked = 0, started = 0, result = null;
 
 /** Ask the worker to label the file, or only to show it. Answers to earlier requests are then ignored. */
 function ask(isPreview = false) {
-  if (!file || !models.length) return;
+  if (!file || !models.length || document.documentElement.dataset.state === "unusable") return;
   result = null;
   asked++;
   started = performance.now();
@@ -50,10 +50,10 @@ const ON_MESSAGE = {
   failed: ({ text }) => fail(text),
 };
 
-function fail(text) {
+function fail(text, state = "failed") {
   byId("problem").textContent = text;
   byId("problem").hidden = false;
-  setState("failed", "");
+  setState(state, "");
 }
 
 /** Show a scan in a new frame, from the same point of view as the scan before. */
@@ -89,7 +89,7 @@ function open(files) {
 
 async function start() {
   worker.onmessage = ({ data }) => data.id === asked && ON_MESSAGE[data.kind](data);
-  worker.onerror = () => fail("expected a browser of 2023 or later, found one that cannot run this page; use another");
+  worker.onerror = () => fail("expected a browser of 2023 or later, found one that cannot run this page; use another", "unusable");
   takeDrops(window);
   byId("file").onchange = ({ target }) => {
     open(target.files);

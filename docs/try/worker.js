@@ -75,11 +75,11 @@ async function bytesOf(file) {
 async function start(wanted) {
   const isPossible = wanted === "webgpu" && "Suspending" in WebAssembly;
   const adapter = isPossible ? await navigator.gpu?.requestAdapter() : null, device = adapter ? "webgpu" : "wasm";
-  const ort = await import(`./ort/ort.${adapter ? "jspi" : "wasm"}.min.mjs`);
+  const [api, core] = adapter ? ["ort.jspi.min", "ort-wasm-simd-threaded.jspi"] : ["ort.wasm.min", "ort-wasm-simd-threaded"];
+  const ort = await import(`./ort/${api}.js`);
   const threads = crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, MAX_THREADS) : 1;
-  ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
-  ort.env.wasm.wasmBinary = await unpacked(`ort/ort-wasm-simd-threaded${adapter ? ".jspi" : ""}.wasm.gz`);
-  ort.env.wasm.numThreads = threads;
+  const wasmPaths = { mjs: new URL(`./ort/${core}.js`, import.meta.url).href };
+  Object.assign(ort.env.wasm, { wasmPaths, wasmBinary: await unpacked(`ort/${core}.wasm.gz`), numThreads: threads });
   const many = threads > 1 ? `${threads} threads` : "one thread";
   return { ort, device, text: adapter ? "on the GPU" : `with ${many}` };
 }
