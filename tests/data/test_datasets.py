@@ -320,8 +320,27 @@ def test_opening_names_what_it_looked_for(tmp_path: Path) -> None:
     make_semantickitti(tmp_path)
     fails(lambda: open_dataset(f"semantickitti:{tmp_path}@v1.0-mini"), tmp_path, "v1.0-mini")
     assert open_dataset(str(tmp_path)).taxonomy is SEMANTICKITTI
-    inside = tmp_path / "sequences" / "08"
-    fails(lambda: open_dataset(str(inside)), "whole dataset", str(tmp_path.absolute()))
+
+
+@pytest.mark.parametrize(
+    "inside", ["sequences/08", "sequences/08/velodyne", "samples/LIDAR_TOP", "v1.0-mini"]
+)
+def test_a_part_of_a_dataset_names_the_folder_of_the_whole(tmp_path: Path, inside: str) -> None:
+    make_semantickitti(tmp_path / "kitti")
+    make_nuscenes(tmp_path / "nuscenes")
+    (whole,) = [folder for folder in tmp_path.iterdir() if (folder / inside).is_dir()]
+    fails(lambda: open_dataset(str(whole / inside)), "give the folder of the whole dataset", whole)
+
+
+@pytest.mark.parametrize("folder", ["scans", "scans/monday", "drive/more/monday"])
+@pytest.mark.parametrize("neighbour", ["drive/velodyne", "sequences/08/velodyne", "v1.0-mini"])
+def test_a_neighbour_with_the_layout_of_a_dataset_does_not_change_the_advice(
+    tmp_path: Path, folder: str, neighbour: str
+) -> None:
+    for name in (folder, neighbour):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / neighbour / "sample_data.json").touch()
+    fails(lambda: open_dataset(str(tmp_path / folder)), "describe the scans in a YAML file")
 
 
 def test_a_folder_with_a_description_names_the_yaml_file(tmp_path: Path) -> None:

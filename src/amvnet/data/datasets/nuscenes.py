@@ -21,6 +21,7 @@ from amvnet.files import checked_token
 from amvnet.scan import Scan
 
 CHANNEL = "LIDAR_TOP"
+FOLDERS = ("samples", "sweeps", "lidarseg", "maps")  # next to the folders of the tables
 MAX_LISTED = 20  # limit on the scenes in a message
 MINI = "v1.0-mini"
 TEST = "v1.0-test"
@@ -84,6 +85,12 @@ class NuScenes(Dataset):
     def matches(root: Path) -> bool:
         """Return whether a folder has this layout."""
         return any(root.glob("v1.0-*/sample_data.json"))
+
+    @staticmethod
+    def holds(root: Path, folder: Path) -> bool:
+        """Return whether a folder below `root` is part of a dataset in `root`."""
+        first = folder.relative_to(root).parts[0]
+        return NuScenes.matches(root) and (first in FOLDERS or first.startswith("v1.0-"))
 
     def official(self, split: str) -> tuple[str, ...]:
         """Return the scenes of a split of `SPLITS` that are on disk."""

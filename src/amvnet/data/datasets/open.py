@@ -124,8 +124,10 @@ def _guess_reader(path: Path) -> Reader:
 
 def _advice_for(path: Path) -> str:
     """Return what a user can do about a folder that has the layout of no dataset."""
-    for parent in list(path.absolute().parents)[:DEEPEST]:
-        if _readers_of(parent):
+    folder = path.absolute()
+    for parent in folder.parents[:DEEPEST]:
+        # An unrelated folder next to this one may have the layout of a dataset.
+        if any(reader.holds(parent, folder) for reader in READERS.values()):
             return f"give the folder of the whole dataset, {parent}"
     described = [file for file in sorted(path.iterdir()) if file.suffix.lower() in ENDINGS]
     if described:

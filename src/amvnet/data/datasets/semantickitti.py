@@ -39,6 +39,15 @@ class SemanticKitti(Dataset):
         """Return whether a folder has this layout."""
         return any(root.glob("sequences/*/velodyne")) or any(root.glob("*/velodyne"))
 
+    @staticmethod
+    def holds(root: Path, folder: Path) -> bool:
+        """Return whether a folder below `root` is part of a dataset in `root`."""
+        first, *rest = folder.relative_to(root).parts
+        if first == "sequences":
+            return any(root.glob("sequences/*/velodyne"))
+        # `root` may be the folder of the sequences.
+        return (root / first / "velodyne").is_dir() and rest in ([], ["velodyne"], ["labels"])
+
     def official(self, split: str) -> tuple[str, ...]:
         """Return the sequences of "train", "val", "test" or "all" that are on disk."""
         present = self._sequences_on_disk()
