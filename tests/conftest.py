@@ -10,8 +10,10 @@ import pytest
 from amvnet.engines import onnx as onnx_engine
 from amvnet.engines import precision
 from amvnet.engines import torch as torch_engine
+from amvnet.export import onnx as onnx_export
 from amvnet.scan import Scan
 
+from fixtures.exports import converting_once
 from fixtures.submissions import MAKERS, Case
 
 LASERS = 16
@@ -46,6 +48,20 @@ def on_cpu() -> Iterator[None]:
 @pytest.fixture
 def random_scan() -> Callable[..., Scan]:
     return _random_scan
+
+
+@pytest.fixture(scope="module")
+def graphs_converted_once(
+    tmp_path_factory: pytest.TempPathFactory, worker_id: str
+) -> Iterator[None]:
+    """Convert a graph to ONNX once in all processes that run tests, and copy the file later."""
+    folder = tmp_path_factory.getbasetemp()
+    if worker_id != "master":
+        folder = folder.parent  # all processes share it
+    with pytest.MonkeyPatch.context() as patch:
+        convert = converting_once(onnx_export._convert, folder / "graphs")
+        patch.setattr(onnx_export, "_convert", convert)
+        yield
 
 
 @pytest.fixture(scope="session")

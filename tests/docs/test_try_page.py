@@ -114,7 +114,7 @@ def served(folder: Path, headers: dict[str, str]) -> Iterator[Site]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> Path:
     """Build the page with tiny weights beside the built-in ones; return the folder around it."""
     spec = importlib.util.spec_from_file_location("try_page", ROOT / "docs" / "try_page.py")
     assert spec is not None

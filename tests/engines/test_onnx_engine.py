@@ -32,8 +32,10 @@ WEIGHTS = fresh_weights()
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Use one cache in all tests: an export takes ten seconds."""
+def cache(
+    tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None
+) -> Iterator[Path]:
+    """Use one cache in all tests."""
     pytest.importorskip("onnxruntime")
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:

@@ -51,7 +51,7 @@ class Kernel:
 
 
 @pytest.fixture(scope="module")
-def weights() -> Weights:
+def weights(graphs_converted_once: None) -> Weights:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library)
     return without(fresh_weights(), "point_head")

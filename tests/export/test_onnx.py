@@ -72,7 +72,7 @@ Exports = dict[str, Export]  # by what the rows of the range image are
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Exports:
+def exported(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> Exports:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library)
 

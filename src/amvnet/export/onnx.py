@@ -339,9 +339,29 @@ def _shares(features: Tensor) -> Tensor:
 
 def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
     """Write one graph and compare it with torch; return its description."""
+    expected = graph.module(*graph.inputs.values())
+    _convert(graph, name, path)
+    inputs, outputs, actual = _run(path, graph)
+    difference = _difference(graph, expected, actual)
+    if not difference <= LARGEST_DIFFERENCE:  # also if it is NaN
+        raise InputError(
+            f"{name}: expected a difference of at most {LARGEST_DIFFERENCE:g} between ONNX Runtime "
+            f"and torch, found {difference:.2g}; use other versions of {', '.join(LIBRARIES)}"
+        )
+    return {
+        "file": path.name,
+        "precision": "float32",
+        "sha256": digest(path),
+        "inputs": inputs,
+        "outputs": outputs,
+        "difference": difference,
+    }
+
+
+def _convert(graph: Graph, name: str, path: Path) -> None:
+    """Write one graph to a file of ONNX."""
     from onnxscript.optimizer import optimize
 
-    expected = graph.module(*graph.inputs.values())
     axes = None
     if name in DYNAMIC:
         axis = torch.export.Dim(DYNAMIC[name], min=1)
@@ -364,22 +384,6 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
         optimize(program.model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
         program.save(path, external_data=False)
     strip(path)
-
-    inputs, outputs, actual = _run(path, graph)
-    difference = _difference(graph, expected, actual)
-    if not difference <= LARGEST_DIFFERENCE:  # also if it is NaN
-        raise InputError(
-            f"{name}: expected a difference of at most {LARGEST_DIFFERENCE:g} between ONNX Runtime "
-            f"and torch, found {difference:.2g}; use other versions of {', '.join(LIBRARIES)}"
-        )
-    return {
-        "file": path.name,
-        "precision": "float32",
-        "sha256": digest(path),
-        "inputs": inputs,
-        "outputs": outputs,
-        "difference": difference,
-    }
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:
