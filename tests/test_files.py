@@ -39,7 +39,7 @@ from lidarstreets.layouts import write_whole
 from fixtures.commands import fails, refusal, run_cli
 from fixtures.datasets import MAKERS, make_nuscenes
 from fixtures.surroundings import LINKS, NAMES, PRECIOUS, REFUSED, contents_outside, surroundings
-from fixtures.tiny import fake_drive, fresh_weights, street, without, write_recipe
+from fixtures.tiny import fresh_weights, make_simulation_quick, street, without, write_recipe
 
 COUNT = 7  # points of a scan
 
@@ -299,8 +299,7 @@ def test_names_in_the_data_do_not_lead_a_command_elsewhere(
         pytest.importorskip("embreex")
         monkeypatch.setattr(demo, "SEQUENCES", 1)
         monkeypatch.setattr(demo, "SCANS", 1)
-        drive = partial(fake_drive, "hdl64e")
-        monkeypatch.setattr("lidarstreets.writing.drive_street", lambda _, *rest: drive(*rest))
+        make_simulation_quick(monkeypatch)
     with surroundings(make=make_hostile) as base:
         monkeypatch.setattr(tempfile, "tempdir", str(base / "data/temporary"))
         monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))  # torch keeps its cache

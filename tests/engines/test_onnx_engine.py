@@ -32,9 +32,7 @@ WEIGHTS = fresh_weights()
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(
-    tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None
-) -> Iterator[Path]:
+def cache(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> Iterator[Path]:
     """Use one cache in all tests."""
     pytest.importorskip("onnxruntime")
     folder = tmp_path_factory.mktemp("cache")

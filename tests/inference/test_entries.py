@@ -219,7 +219,7 @@ OF_DATASETS = (by_predict_of_a_dataset, by_evaluate_of_a_dataset)
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> World:
+def saved(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> World:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library)
 

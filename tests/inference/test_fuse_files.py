@@ -24,6 +24,7 @@ from amvnet.weights.file import load, save
 from fixtures.commands import commands_of, files, run_cli
 from fixtures.tiny import (
     fresh_weights,
+    make_simulation_quick,
     make_streets,
     street,
     without,
@@ -402,7 +403,7 @@ def test_a_digest_of_scores_sees_any_changed_point_of_an_archive_and_the_last_of
 
 
 def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("embreex")
+    make_simulation_quick(monkeypatch)
     monkeypatch.chdir(tmp_path)
     shutil.copy(DOCS / "tiny_model.py", tmp_path)
     commands = commands_of("docs/fusing.md")

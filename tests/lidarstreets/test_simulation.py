@@ -15,6 +15,8 @@ from lidarstreets import LIDAR_MODELS, Drive, SimulatedScan, SimulationError, dr
 from lidarstreets.sensing.sensors import LidarModel, draw_device
 from lidarstreets.streets.kinds import STREET_KINDS
 
+from fixtures.tiny import make_simulation_quick
+
 # Raw ids of SemanticKITTI.
 THING_IDS = {10, 11, 13, 15, 18, 20, 30, 31, 32}
 OUTLIER_ID = 1
@@ -95,8 +97,8 @@ def test_layout_is_that_of_semantickitti(street: Path) -> None:
         assert np.loadtxt(folder / "times.txt").shape == (2,)
 
 
-def test_progress_counts_every_scan(tmp_path: Path) -> None:
-    pytest.importorskip("embreex")
+def test_progress_counts_every_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_simulation_quick(monkeypatch)
     calls = []
     simulate(
         tmp_path, sequences=2, scans=1, progress=lambda done, total: calls.append((done, total))
@@ -133,7 +135,7 @@ def test_without_motion_every_point_lies_on_its_beam_within_the_sensors_ranges(
     sensor = exact_device(replace(LIDAR_MODELS[name], rotation_period=0.0, range_error=0.0))
     beams = np.array(sensor.elevations)[::-1]
     heights = np.interp(beams, *np.transpose(sensor.origins))
-    for scan in drive_street(sensor, 2, np.random.SeedSequence(seed)):
+    for scan in drive_street(sensor, 1, np.random.SeedSequence(seed)):
         # Lost returns have no label, and no place on a beam.
         is_return = scan.labels > 0
         assert is_return.all() or sensor.keeps_lost_returns
@@ -217,9 +219,9 @@ def test_devices_of_a_type_differ_a_little() -> None:
 def test_a_long_sequence_continues_in_another_street() -> None:
     pytest.importorskip("embreex")
     drive = Drive(scans_per_street=1)
-    scans = drive_street(HDL64E, 3, np.random.SeedSequence(1), drive)
+    scans = drive_street(HDL64E, 2, np.random.SeedSequence(1), drive)
     positions = [scan.pose[0, 3] for scan in scans]
-    assert np.allclose(positions, [0, drive.spacing, 2 * drive.spacing])
+    assert np.allclose(positions, [0, drive.spacing])
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ import pytest
 from amvnet.data.datasets.open import open_dataset
 from lidarstreets import SimulationError, simulate, writing
 
-from fixtures.tiny import fake_drive
+from fixtures.tiny import make_simulation_quick
 
 pytest.importorskip("embreex")
 
@@ -151,7 +151,7 @@ def test_a_sequence_whose_record_is_broken_is_written_again(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A power cut may leave an empty file."""
-    monkeypatch.setattr(writing, "drive_street", lambda _, *rest: fake_drive("hdl64e", *rest))
+    make_simulation_quick(monkeypatch)
     settings: dict[str, Any] = {"scans": 1, "seed": 3}
     simulate(tmp_path, sequences=2, **settings)
     before = digests(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -49,6 +50,7 @@ def test_vehicles_of_one_lane_do_not_overlap(seed: int) -> None:
                 assert gap > 0.9 * lengths
 
 
+@cache
 def draw_site(seed: int) -> tuple[Site, np.ndarray]:
     """Return a street and the poses (x, y, yaw) of four scans in it."""
     rng = np.random.default_rng(seed)
