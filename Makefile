@@ -6,14 +6,18 @@ SPREAD := OMP_NUM_THREADS=1
 # The least share of lines that `make test COVERAGE=1` must run, in percent: raise it to two points below what CI prints.
 COVERAGE_FLOOR := 89
 
-.PHONY: install demo test test-slow bench gpu docs lint format release clean
+.PHONY: install demo test run-tests test-slow bench gpu docs lint format release clean
 
 install: .venv/installed  ## the package and all that its tests need, in .venv
 
 demo: .venv/installed  ## simulate streets, segment and score them, and show all in demo/index.html
 	$(BIN)/amvnet demo --out demo --overwrite
 
-test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 fails if they run too few lines
+# Style and types are checked beside the tests, because mypy uses one processor for a minute. Each tool prints all that it found at once.
+test: .venv/installed  ## style, types and the tests; COVERAGE=1 fails if they run too few lines
+	@$(MAKE) --no-print-directory --jobs=2 lint run-tests
+
+run-tests: .venv/installed
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile $(if $(COVERAGE),--cov=amvnet --cov=lidarstreets --cov-report=term:skip-covered --cov-fail-under=$(COVERAGE_FLOOR))
 
 test-slow: .venv/installed .venv/fleet  ## all tests, also the tests that take minutes and the tests of fleets
