@@ -17,7 +17,6 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
@@ -35,6 +34,8 @@ class Runner(OnnxSegmenter):
     """A segmenter with a number of threads, which keeps the last inputs of its graphs."""
 
     def __init__(self, folder: str, threads: int) -> None:
+        import onnxruntime  # after amvnet, which turns its telemetry off
+
         super().__init__(folder)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads

@@ -73,6 +73,20 @@ def test_one_line_names_the_option_and_what_was_meant(command: str, words: str) 
     assert "class" not in line.replace("class_weights", "")
 
 
+@pytest.mark.parametrize("inputs", ["-first.bin", "a.bin -first.bin", "a.bin --first.bin"])
+def test_a_file_whose_name_looks_like_an_option_is_told_how_to_be_given(
+    inputs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    name = inputs.split()[-1]
+    Path(name).touch()
+    line = refusal(f"predict {inputs} --weights sim-hdl64e --out o")
+    assert line.endswith(f"found {name}; for the file of this name, give ./{name}\n")
+
+    Path(name).unlink()
+    assert f"found {name}; " in refusal(f"predict {inputs} --weights sim-hdl64e --out o")
+
+
 def test_values_that_begin_with_a_minus_need_no_equals_sign() -> None:
     words = [
         "a",

@@ -9,7 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -114,20 +115,31 @@ sys.exit(main.main())
 """
 
 
+@contextmanager
+def running(script: str, environment: Mapping[str, str]) -> Iterator[subprocess.Popen[str]]:
+    """Run a script in a process of its own, and yield the process once it prints `ready`."""
+    with subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield process
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_does_not_end_is_ended(number: int, tmp_path: Path) -> None:
     """It leaves no half file, and says one line."""
     script = STUBBORN.replace("{path}", str(tmp_path / "a.txt"))
-    with subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert process.stdout.readline() == "ready\n"
+    with running(script, os.environ) as process:
         start = time.monotonic()
         process.send_signal(number)
         assert process.wait(60) == 128 + number
         assert time.monotonic() - start < SOON
+        assert process.stderr is not None
         assert process.stderr.read() == "amvnet: stopped; go on with --resume\n"
     assert not list(tmp_path.iterdir())
 
@@ -310,11 +322,7 @@ def test_a_stopped_command_leaves_no_temporary_folder(tmp_path: Path) -> None:
     script = TEMPORARY.replace("{scan}", str(tmp_path / "a.laz"))
     script = script.replace("{out}", str(tmp_path / "out"))
     environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
-    with subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
+    with running(script, environment) as process:
         assert len(list((tmp_path / "temporary").iterdir())) == 1
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 143

@@ -296,9 +296,15 @@ def test_nuscenes_own_names_of_splits_are_taken(tmp_path: Path) -> None:
     assert dataset.scenes("mini_train") == dataset.scenes("train")
 
 
-def test_an_empty_split_names_the_one_of_all_scans(layout: Layout) -> None:
+def test_an_empty_split_names_sequences_that_were_not_trained_on(layout: Layout) -> None:
     dataset = open_dataset(layout.spec)
-    fails(lambda: dataset.sequences("test"), "--split all", "--sequences ")
+    (val,) = dataset.official("val")
+    fails(lambda: dataset.official("test"), f"not trained, such as --sequences {val}")
+
+
+def test_of_sequences_to_train_on_none_is_advised(tmp_path: Path) -> None:
+    dataset = open_dataset(str(make_streets(tmp_path, ("03", "04"), 1)))
+    fails(lambda: dataset.official("val"), "not trained, with --sequences")
 
 
 def test_a_scan_below_a_folder_with_an_at_sign_is_a_scan(tmp_path: Path) -> None:

@@ -202,15 +202,12 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("kills", [1, 2])
-def test_a_killed_run_goes_on_where_it_stopped(
-    world: Path, whole: Path, tmp_path: Path, kills: int
-) -> None:
-    """After SIGKILL, once or twice, no scan is segmented again, and the labels are the same."""
+def test_a_killed_run_goes_on_where_it_stopped(world: Path, whole: Path, tmp_path: Path) -> None:
+    """After SIGKILL, also twice, no scan is segmented again, and the labels are the same."""
     out = tmp_path / "out"
     command = predict(world, out, "--resume")
     times: dict[str, int] = {}
-    for kill in range(1, kills + 1):
+    for kill in (1, 2):
         process = subprocess.Popen(
             [sys.executable, "-c", SLOW_CLI, *command.split()], stdout=subprocess.DEVNULL
         )
@@ -225,6 +222,16 @@ def test_a_killed_run_goes_on_where_it_stopped(
     assert run_cli(*command.split()) == (0, "")
     check_same(out, whole)
     check_kept(out, times)
+
+
+@pytest.mark.parametrize("options", ["", "--overwrite", "--resume"])
+def test_the_output_of_a_run_is_checked_once(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str
+) -> None:
+    checked: list[object] = []
+    monkeypatch.setattr("amvnet.inference.pipeline.check_outputs", lambda *_: checked.append(None))
+    succeed(predict(world, tmp_path, options))
+    assert len(checked) == 1
 
 
 def check_kept(folder: Path, times: dict[str, int]) -> None:

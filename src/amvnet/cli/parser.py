@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import inspect
 import math
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from amvnet.cli.console import report_lines
 from amvnet.config.bounds import Range
 from amvnet.errors import InputError, did_you_mean, shown
 
+OF_THIS_NAME = "for the file of this name, give"  # advice about a file that looks like an option
 NUMBERS = {int: "a whole number", float: "a number"}  # what messages call the types of numbers
 # What stands for an argument in the help. Other arguments are shown by their name in capitals.
 METAVARS = {"inputs": "INPUT", "weights": "W"}
@@ -57,7 +59,8 @@ class Parser(argparse.ArgumentParser):
             wrong = self._wrong_option()
             line = f"expected {missing[1]}, found none; add what is missing"
             line = line if wrong is None else self._unknown(wrong)
-        raise InputError(line if line.endswith("?") else f"{line}; see {self.prog} --help")
+        is_advice = line.endswith("?") or OF_THIS_NAME in line
+        raise InputError(line if is_advice else f"{line}; see {self.prog} --help")
 
     def print_help(self, file: Any = None) -> None:
         """Print the help to the console; `file` is argparse's, and not used."""
@@ -85,14 +88,18 @@ class Parser(argparse.ArgumentParser):
         for word in self._words:
             if word == "--":
                 break
-            if word.startswith("--") and word.split("=")[0] not in self._flags():
+            is_number = self._negative_number_matcher.match(word) or word == "-"
+            if word.startswith("-") and not is_number and word.split("=")[0] not in self._flags():
                 return word
         return None
 
     def _unknown(self, words: str) -> str:
-        word = words.split()[0]
-        if not word.startswith("-"):
+        """Return the message about words that are no options, joined by spaces as by argparse."""
+        if not words.startswith("-"):
             return f"expected nothing more, found {words}; leave it out"
+        word = next((word for word in self._words if word and words.startswith(word)), words)
+        if os.path.lexists(word):
+            return f"expected an option of {self.prog}, found {word}; {OF_THIS_NAME} ./{word}"
         flag = word.split("=")[0]
         flags = self._flags()
         return f"expected an option of {self.prog}, found {flag}{did_you_mean(flag, flags)}"

@@ -104,6 +104,8 @@ class Pipeline:
             rounding.
         at_once: the number of batches that are segmented at the same time, each with its share of
             the threads.
+        is_checked: whether the caller has called `check_output`. A run that resumes checks by
+            itself, because it may replace the files of the earlier run.
     """
 
     scans: Sequence[InputScan]
@@ -112,6 +114,7 @@ class Pipeline:
     taxonomy: Taxonomy
     batch: int = 1
     at_once: int = 1
+    is_checked: bool = False
 
     def run(
         self, settings: Mapping[str, Any], progress: Progress = no_progress
@@ -134,7 +137,8 @@ class Pipeline:
         folder = self.output.folder
         is_new = not folder.exists()
         earlier = read_journals(folder, settings) if self.output.resume else {}
-        check_output(self.scans, self.output, earlier)
+        if self.output.resume or not self.is_checked:
+            check_output(self.scans, self.output, earlier)
         done = self._still_done(earlier)
         remaining = [scan for scan in self.scans if _key(scan) not in done]
         kept = done if self.output.resume else self._entries_of_others(settings)

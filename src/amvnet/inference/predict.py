@@ -92,6 +92,7 @@ def predict(
         taxonomy,
         batch=batch,
         at_once=segmenter.at_once,
+        is_checked=not resume,
     )
     if not resume:
         names = {str(scan.scores_path) for scan in scans}

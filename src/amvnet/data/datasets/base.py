@@ -226,6 +226,18 @@ def check_split(source: Path | str, split: str, splits: Collection[str]) -> None
         )
 
 
+def not_trained_on(unseen: Sequence[str]) -> str:
+    """Return the end of an advice: which sequences to name instead of those of a split.
+
+    Args:
+        unseen: sequences on disk that are not of the official split "train".
+    """
+    advice = "sequences on which the weights were not trained"
+    if not unseen:
+        return f"{advice}, with --sequences"
+    return f"{advice}, such as --sequences {','.join(unseen[:3])}"
+
+
 def _id_type(path: Path) -> type[np.unsignedinteger]:
     """Return the type of the ids in a prediction: uint8 of nuScenes, uint32 of all others."""
     return np.uint8 if path.suffix == ".bin" else np.uint32

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
+from amvnet.data.datasets.base import Dataset, ScanRecord, check_split, not_trained_on
 from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
@@ -98,22 +98,22 @@ class NuScenes(Dataset):
         folder = self.root / "samples" / CHANNEL
         file_names = set(os.listdir(folder)) if folder.is_dir() else set()
 
-        present = []
-        for scene in scenes:
-            records = self._records_by_scene[scene]
+        on_disk = []
+        for scene, records in sorted(self._records_by_scene.items()):
             if any(record.points_path.name in file_names for record in records):
-                present.append(scene)
+                on_disk.append(scene)
 
+        present = tuple(scene for scene in on_disk if scene in scenes)
         if not present:
-            examples = sorted(self._records_by_scene)[:3]
+            unseen = [scene for scene in on_disk if not self._split(scene).endswith("train")]
+            advice = f"or name {not_trained_on(unseen)}" if on_disk else "which the tables list"
             raise InputError(
                 f"{folder}: expected scans of {split} scenes "
                 f"({len(scenes)} in the tables of {self.version}), found none; "
-                "give --split all, or name the scenes to use, such as "
-                f"--sequences {','.join(examples)}"
+                f"unpack their files, {advice}"
             )
 
-        return tuple(present)
+        return present
 
     def scenes(self, split: str) -> tuple[str, ...]:
         """Return the scenes of a split that the tables list, on disk or not.

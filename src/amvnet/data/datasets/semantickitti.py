@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
+from amvnet.data.datasets.base import Dataset, ScanRecord, check_split, not_trained_on
 from amvnet.data.formats.cloud import check_usable
 from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import check_bits, read_ids, train_ids
@@ -55,10 +55,11 @@ class SemanticKitti(Dataset):
         check_split(self.root, split, splits)
         sequences = tuple(sequence for sequence in splits[split] if sequence in present)
         if not sequences:
+            unseen = [name for name in present if name not in splits["train"]]
             raise InputError(
                 f"{self.root}: expected a sequence of the {split} split "
                 f"({', '.join(splits[split])}), found {', '.join(present)}; "
-                f"give --split all, or name the sequences to use, such as --sequences {present[0]}"
+                f"add one, or name {not_trained_on(unseen)}"
             )
 
         return sequences
