@@ -14,7 +14,7 @@ from lidarstreets import LIDAR_MODELS
 
 from fixtures.commands import commands_of, run_cli
 from fixtures.own_scans import CLASSES, make_own_scans
-from fixtures.tiny import fresh_weights, write_recipe
+from fixtures.tiny import fresh_weights, simulate_in_this_process, write_recipe
 
 PAGE = "docs/own_data.md"
 ONE_EPOCH = {"rv": {"epochs": 1}, "bev": {"epochs": 1}, "head": {"epochs": 1}}
@@ -32,6 +32,7 @@ def test_every_command_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("embreex")
+    simulate_in_this_process(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "cache"))
     recipe = write_recipe(tmp_path / "tiny.yaml", training=ONE_EPOCH)
