@@ -22,7 +22,7 @@ from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_n
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.commands import files, run_cli
-from fixtures.processes import become_cli, fork_server, start_cli
+from fixtures.processes import Printed, become_cli, fork_server, start_cli
 from fixtures.tiny import make_streets, without, write_recipe
 
 # No DropBlock, as each process draws its own blocks. Double precision, as AdamW divides each
@@ -63,11 +63,15 @@ def output_of_launch(folder: Path, *arguments: object) -> str:
         start_method="forkserver",
     )
     elastic_launch(config, _become_rank)(list(map(str, arguments)), folder)
-    return "".join((folder / f"printed by {rank}").read_text() for rank in range(2))
+    return "".join(printed_by(rank, folder).text for rank in range(2))
 
 
 def _become_rank(words: list[str], folder: Path) -> None:
-    become_cli(words, folder / f"printed by {os.environ['RANK']}")
+    become_cli(words, printed_by(int(os.environ["RANK"]), folder))
+
+
+def printed_by(rank: int, folder: Path) -> Printed:
+    return Printed(folder / f"printed by {rank}")
 
 
 def slurm(folder: Path, *arguments: object) -> list[tuple[int | None, str]]:
@@ -89,16 +93,14 @@ def slurm(folder: Path, *arguments: object) -> list[tuple[int | None, str]]:
         "OMP_NUM_THREADS": "1",
     }
     words = list(map(str, arguments))
-    outputs = [folder / f"printed by {rank}" for rank in range(2)]
     processes = []
-    for rank, output in enumerate(outputs):
+    for rank in range(2):
         ranks = {"SLURM_PROCID": str(rank), "SLURM_LOCALID": str(rank)}
-        processes.append(start_cli(words, os.environ | job | ranks, output))
+        processes.append(start_cli(words, printed_by(rank, folder), os.environ | job | ranks))
     for process in processes:
         process.join()
     return [
-        (process.exitcode, output.read_text())
-        for process, output in zip(processes, outputs, strict=True)
+        (process.exitcode, printed_by(rank, folder).text) for rank, process in enumerate(processes)
     ]
 
 
