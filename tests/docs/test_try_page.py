@@ -210,10 +210,11 @@ def session(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
         {"file": str(files["own"]), "model": 2},
         {"file": str(files["broken"]), "model": 0},
         {"drop": ["a.bin", "b.bin"], "model": 0},
+        {"file": str(files["kitti"]), "model": 0, "isSlow": True},
     ]
     with served(folder, ISOLATION) as site:
         report = drive(site, cases, scans)
-    results = dict(zip([*files, "several"], report["results"], strict=True))
+    results = dict(zip([*files, "several", "slow"], report["results"], strict=True))
     return Session(report, results, files, site)
 
 
@@ -308,6 +309,17 @@ def test_steps_have_times_and_the_line_says_what_was_assumed(session: Session) -
     assert titles[:2] == ["read", "normalise"]
     assert {"range-view network", "bird's-eye-view network", "point head", "merge"} <= set(titles)
     assert "moved by" in result["assumed"]
+
+
+def test_the_page_answers_while_it_labels_and_draws_slowly(session: Session) -> None:
+    result = session.results["slow"]
+    assert result["state"] == "labelled"
+    assert result["longestWait"] < result["pictureTime"]
+    assert result["moving"] < result["pictureTime"]
+
+
+def test_a_scan_is_drawn_once(session: Session) -> None:
+    assert session.results["slow"]["pictures"] == 1
 
 
 def test_nothing_leaves_the_folder_of_the_page(session: Session) -> None:

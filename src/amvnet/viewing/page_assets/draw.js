@@ -1,14 +1,19 @@
 // Draw one scan with WebGL 2.
+//
+// A browser without a GPU needs up to seconds for a picture, and at each frame the page waits until its canvas is drawn. So
+// the picture is drawn beside the canvas, and copied to the canvas after it is finished.
 "use strict";
 
 const ATTRIBUTES = { position: 0, intensity: 1, disagreement: 2, label: 3, truth: 4, uncertain: 5 };
 const RINGS = [10, 20, 30, 40, 50], SIDES = 180;  // the radii of the rings on the ground, metres, and their corners
 // The most pixels of the canvas. For smooth edges, it has up to twice the window's resolution.
 const MAX_PIXELS = 6e6;
+const POLL = 4;  // the time between two questions whether the GPU has finished, milliseconds
+const PATIENCE = 5000;  // the longest time to wait for the GPU, milliseconds
 
 class Drawing {
   constructor(canvas) {
-    const gl = canvas.getContext("webgl2", { antialias: true, alpha: true });
+    const gl = canvas.getContext("webgl2", { antialias: false, depth: false, alpha: true });
     if (!gl) throw new Error("This page draws with WebGL 2, which this browser does not offer.");
     this.gl = gl;
     this.canvas = canvas;
@@ -81,12 +86,14 @@ class Drawing {
     return buffer;
   }
 
-  /** Make textures for the points. The points are drawn into them first, so that a shader can read the depth. */
+  /** Make textures for the points, so that a shader can read their depth, and the picture that the shader draws. */
   makeTarget() {
     const gl = this.gl;
     this.colors = this.texture(2, null);
     this.depths = this.texture(3, null);
     this.target = gl.createFramebuffer();
+    this.picture = gl.createFramebuffer();
+    this.pixels = gl.createRenderbuffer();
   }
 
   resize() {
@@ -97,7 +104,6 @@ class Drawing {
     this.ratio = ratio;
     if (this.width === width && this.height === height) return;
     Object.assign(this, { width, height });
-    Object.assign(this.canvas, { width, height });
     gl.activeTexture(gl.TEXTURE2);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
     gl.activeTexture(gl.TEXTURE3);
@@ -107,6 +113,10 @@ class Drawing {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.colors, 0);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, this.depths, 0);
+    gl.bindRenderbuffer(gl.RENDERBUFFER, this.pixels);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.RGBA8, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.picture);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, this.pixels);
   }
 
   /** Return the buffers of a scan; they are made when it is first drawn. */
@@ -146,21 +156,40 @@ class Drawing {
     }
   }
 
+  /** Let the GPU draw the picture; `matrix` is then the matrix from metres to its clip space. */
   draw(scan, look, camera) {
     const gl = this.gl;
     this.resize();
-    const matrix = camera.matrix(this.width / this.height);
+    this.matrix = camera.matrix(this.width / this.height);
     gl.viewport(0, 0, this.width, this.height);
-    this.drawPoints(scan, look, matrix);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    this.drawPoints(scan, look);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.picture);
+    gl.clear(gl.COLOR_BUFFER_BIT);
     gl.disable(gl.DEPTH_TEST);
-    if (look.rings) this.drawRings(matrix);
+    if (look.rings) this.drawRings();
     this.drawScreen(look, camera);
   }
 
-  drawPoints(scan, look, matrix) {
+  /** Wait until the picture is finished, while the page goes on. */
+  async finished() {
+    const gl = this.gl, sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), end = performance.now() + PATIENCE;
+    const isDrawing = () => !gl.isContextLost() && gl.getSyncParameter(sync, gl.SYNC_STATUS) === gl.UNSIGNALED;
+    gl.flush();
+    do await new Promise((resolve) => setTimeout(resolve, POLL));
+    while (isDrawing() && performance.now() < end);
+    gl.deleteSync(sync);
+  }
+
+  /** Copy the picture to the canvas. */
+  present() {
+    const { gl, canvas, width, height } = this;
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.picture);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+    gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+  }
+
+  drawPoints(scan, look) {
     const gl = this.gl, { program, places } = this.points;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.clearColor(0, 0, 0, 0);
@@ -170,7 +199,7 @@ class Drawing {
     this.bind(scan, look.labels);
     this.fill(0, look.classColors());
     this.fill(1, look.rampColors());
-    gl.uniformMatrix4fv(places.matrix, false, matrix);
+    gl.uniformMatrix4fv(places.matrix, false, this.matrix);
     gl.uniform3fv(places.center, scan.center);
     gl.uniform3fv(places.unit, scan.step);
     gl.uniform2fv(places.range, look.range());
@@ -186,11 +215,11 @@ class Drawing {
     gl.drawArrays(gl.POINTS, 0, scan.count);
   }
 
-  drawRings(matrix) {
+  drawRings() {
     const gl = this.gl, { program, places } = this.lines;
     gl.useProgram(program);
     gl.bindVertexArray(this.rings);
-    gl.uniformMatrix4fv(places.matrix, false, matrix);
+    gl.uniformMatrix4fv(places.matrix, false, this.matrix);
     gl.uniform1f(places.strength, 0.13);
     RINGS.forEach((radius, place) => gl.drawArrays(gl.LINE_LOOP, place * SIDES, SIDES));
     gl.uniform1f(places.strength, 0.4);

@@ -23,10 +23,10 @@ class Tape {
     this.redraw();
   }
 
-  draw(scan, camera) {
+  draw(scan, matrix) {
     const canvas = byId("canvas"), { clientWidth: width, clientHeight: height } = canvas;
     const places = this.ends.map((end) => placeOf(scan, end));
-    const seen = places.map((place) => projected(place, camera.matrix(width / height)));
+    const seen = places.map((place) => projected(place, matrix));
     const visible = this.on && seen.length === 2 && seen.every(([, , , w]) => w > 0);
     byId("tape").toggleAttribute("hidden", !visible);
     byId("length").hidden = !this.on || (seen.length === 2 && !visible);

@@ -5,19 +5,44 @@ const look = new Look(), camera = new Camera();
 const PLAY_INTERVAL = 800;  // the time between two scans during playback, milliseconds
 const KEY_MOVE = 0.04;  // the movement of one key press, as a fraction of the window's height
 const KEY_TURN = 0.023;  // the turn of one key press, as a fraction of the window's height; 4 degrees
-let drawing, panel, tape, editor, scan = null, chosen = -1, asked = 0, playing = 0, remembering = 0;
+let drawing, panel, tape, editor, scan = null, chosen = -1, playing = 0, remembering = 0;
+let isStale = false, isDrawing = false;
 
+/** Draw after the next frame, or after the picture on which the GPU works now. */
 function redraw() {
-  if (!asked) asked = requestAnimationFrame(draw);
+  isStale = true;
+  if (isDrawing) return;
+  isDrawing = true;
+  // The frame shows the picture before. The GPU finishes its work in order, so the next picture begins after the frame.
+  requestAnimationFrame(() => setTimeout(nextPicture));
 }
 
-function draw() {
-  asked = 0;
-  if (!scan) return;
+async function nextPicture() {
+  isStale = false;
+  if (scan) {
+    begin();
+    await drawing.finished();
+    end();
+  }
+  isDrawing = false;
+  if (isStale) redraw();
+}
+
+function begin() {
   camera.middle = panel.free();
   drawing.draw(scan, look, camera);
+}
+
+function end() {
+  drawing.present();
   mark();
-  tape.draw(scan, camera);
+  tape.draw(scan, drawing.matrix);
+}
+
+/** Draw now, even if the page has to wait for the GPU. */
+function draw() {
+  begin();
+  end();
 }
 
 /** Draw the ring around the point that was clicked. */
@@ -25,7 +50,7 @@ function mark() {
   const marker = byId("marker"), canvas = byId("canvas");
   marker.hidden = byId("point").hidden = chosen < 0;
   if (chosen < 0) return;
-  const [u, v, , w] = projected(placeOf(scan, chosen), camera.matrix(canvas.clientWidth / canvas.clientHeight));
+  const [u, v, , w] = projected(placeOf(scan, chosen), drawing.matrix);
   marker.hidden = w <= 0;
   marker.style.left = `${((u / w + 1) / 2) * canvas.clientWidth}px`;
   marker.style.top = `${((1 - v / w) / 2) * canvas.clientHeight}px`;
@@ -96,8 +121,9 @@ function play() {
 
 function click(x, y, isDouble) {
   const { clientWidth: width, clientHeight: height } = byId("canvas");
-  chosen = scan ? pointAt(x, y, scan, look, camera.matrix(width / height), width, height) : -1;
+  chosen = drawing.matrix ? pointAt(x, y, scan, look, drawing.matrix, width, height) : -1;
   if (chosen >= 0) describe(chosen, scan);
+  mark();
   if (chosen >= 0 && tape.on) tape.add(chosen);
   if (chosen >= 0 && isDouble) camera.set({ ...camera, target: placeOf(scan, chosen) });
   moved();

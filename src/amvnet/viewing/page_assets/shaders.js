@@ -76,20 +76,26 @@ uniform highp sampler2D depths;
 uniform float near, far, strength, reach;
 out vec4 painted;
 
-float distance_at(ivec2 pixel) {
+// The reciprocal of the distance, times 2 near far.
+float nearness(ivec2 pixel) {
   float depth = texelFetch(depths, clamp(pixel, ivec2(0), textureSize(depths, 0) - 1), 0).r;
-  return log2(2.0 * near * far / (far + near - (2.0 * depth - 1.0) * (far - near)));
+  return far + near - (2.0 * depth - 1.0) * (far - near);
+}
+
+float hidden_by(ivec2 beside, float own) {
+  return clamp(log2(nearness(beside) / own) - 0.01, 0.0, 0.6);
 }
 
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   vec4 color = texelFetch(colors, pixel, 0);
   if (color.a == 0.0) discard;
-  float own = distance_at(pixel), hidden = 0.0;
-  for (int place = 0; place < 8; place++) {
-    float angle = 0.7853982 * float(place);
-    ivec2 beside = pixel + ivec2(round(reach * vec2(cos(angle), sin(angle))));
-    hidden += clamp(own - distance_at(beside) - 0.01, 0.0, 0.6);
-  }
+  float own = nearness(pixel), hidden = 0.0;
+  int straight = int(round(reach)), oblique = int(round(0.7071068 * reach));
+  ivec2 right = ivec2(straight, 0), up = ivec2(0, straight), rising = ivec2(oblique), falling = ivec2(oblique, -oblique);
+  hidden += hidden_by(pixel + right, own) + hidden_by(pixel - right, own);
+  hidden += hidden_by(pixel + up, own) + hidden_by(pixel - up, own);
+  hidden += hidden_by(pixel + rising, own) + hidden_by(pixel - rising, own);
+  hidden += hidden_by(pixel + falling, own) + hidden_by(pixel - falling, own);
   painted = vec4(color.rgb * max(exp(-strength * hidden), 0.25), 1.0);
 }`;
