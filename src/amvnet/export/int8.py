@@ -13,7 +13,7 @@ import numpy as np
 
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
-from amvnet.export.onnx_files import digest, quiet, strip
+from amvnet.export.onnx_files import digest, quiet, remove_notes
 from amvnet.files import temporary_folder
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.reading import normaliser_for
@@ -191,7 +191,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
 
     ready.unlink()
     os.replace(quantised, path)
-    strip(path)
+    remove_notes(path)
 
 
 def _first_layer(path: Path) -> list[str]:

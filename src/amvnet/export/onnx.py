@@ -18,7 +18,7 @@ from amvnet.config.schema import ModelConfig
 from amvnet.engines.base import build_model
 from amvnet.errors import InputError, import_optional
 from amvnet.export.int8 import KEEPS_FIRST_LAYER, calibration_scans, quantise
-from amvnet.export.onnx_files import digest, quiet, strip
+from amvnet.export.onnx_files import digest, quiet, remove_notes
 from amvnet.files import atomic_write, publish, temporary_folder
 from amvnet.inference.reading import expectation_of
 from amvnet.models.amvnet import AMVNet
@@ -383,7 +383,7 @@ def _convert(graph: Graph, name: str, path: Path) -> None:
         # spite of their size: by default, only small tensors count as constants.
         optimize(program.model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
         program.save(path, external_data=False)
-    strip(path)
+    remove_notes(path)
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:

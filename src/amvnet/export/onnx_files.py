@@ -1,4 +1,7 @@
-"""Digest ONNX files, and remove the notes and warnings of the libraries that write them."""
+"""Digest ONNX files, and silence the libraries that write them.
+
+These libraries leave notes in the files, and print warnings.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,8 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def strip(path: Path) -> None:
-    """Remove the notes of libraries from a graph: they contain paths of this machine."""
+def remove_notes(path: Path) -> None:
+    """Remove what libraries noted in a graph's file: the notes contain paths of this machine."""
     import onnx
 
     model = onnx.load(path)
@@ -28,9 +31,9 @@ def strip(path: Path) -> None:
 
 
 @contextmanager
-def quiet(name: str) -> Iterator[None]:
+def quiet(logger_name: str) -> Iterator[None]:
     """Suppress warnings, and all messages of a library's logger except errors."""
-    logger = logging.getLogger(name)
+    logger = logging.getLogger(logger_name)
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:

@@ -26,8 +26,8 @@ def fill_house(plot: Plot) -> None:
         rng, width, depth, height=rng.uniform(*style.storeys), flat=rng.random() < 0.15
     )
     turn = rng.normal(scale=0.03) if rng.random() < 0.8 else rng.uniform(-0.5, 0.5)
-    middle = plot.front + setback + depth / 2
-    plot.put(house, x, middle, plot.facing + turn, margin=width * 0.5)
+    distance = plot.front + setback + depth / 2
+    plot.put(house, x, distance, plot.facing + turn, margin=width * 0.5)
 
     drive_x = plot.x + 0.3 if rng.random() < 0.5 else plot.end - 3.3
     _add_drive(plot, drive_x, setback + 5.0)
@@ -40,14 +40,15 @@ def fill_house(plot: Plot) -> None:
     _furnish(plot, setback)
 
 
-def _plant_garden(plot: Plot, depth: float) -> None:
+def _plant_garden(plot: Plot, setback: float) -> None:
+    """Put plants between the front of the plot and the house, `setback` metres behind it."""
     rng = plot.rng
     green = plot.style.green
 
-    plant_bushes(plot, rng.poisson(4.0 * green), depth)
+    plant_bushes(plot, rng.poisson(4.0 * green), setback)
 
     for _ in range(rng.poisson(0.6 * green)):
-        distance = plot.front + rng.uniform(0.6, depth + 1)
+        distance = plot.front + rng.uniform(0.6, setback + 1)
         tree = trees.random_tree(rng, rng.uniform(3, 9))
         plot.put(tree, plot.random_x(), distance)
 
@@ -61,13 +62,14 @@ def _plant_garden(plot: Plot, depth: float) -> None:
         bed = plants.flower_bed(rng, plot.width * rng.uniform(0.2, 0.5))
         plot.put(bed, plot.middle, plot.front + rng.uniform(0.8, 3), margin=plot.width * 0.3)
     if rng.random() < 0.2:
-        # Bushes or narrow trees in front of the house.
+        # Bushes or narrow trees stand in a row in front of the house.
         for x in np.arange(plot.x + plot.width * 0.3, plot.end - plot.width * 0.3, 1.4):
             bush = plants.bush(rng, 0.6) if rng.random() < 0.7 else trees.column(rng, 2.0)
-            plot.put(bush, x, plot.front + depth - 0.5)
+            plot.put(bush, x, plot.front + setback - 0.5)
 
 
 def _furnish(plot: Plot, setback: float) -> None:
+    """Put things that people leave in gardens before the house, and sheds beside it."""
     rng = plot.rng
     front = plot.front
 
@@ -82,29 +84,32 @@ def _furnish(plot: Plot, setback: float) -> None:
     if rng.random() < 0.05:
         plot.put(buildings.greenhouse(rng), plot.end - 3, front + setback + 6, margin=5)
     if rng.random() < 0.1:
-        gravel = (front, front + rng.uniform(1, setback + 1))
-        plot.pave((plot.x, plot.end), gravel, Label.OTHER_GROUND)
+        distances = (front, front + rng.uniform(1, setback + 1))
+        plot.pave((plot.x, plot.end), distances, Label.OTHER_GROUND)
 
 
 def _add_drive(plot: Plot, x: float, depth: float) -> None:
-    """Pave a way to a garage, sometimes with a car on it."""
+    """Pave a drive; sometimes put a car on it, and a garage, carport or shed at its end."""
     rng = plot.rng
     front = plot.front
 
     label = Label.PARKING if rng.random() < 0.2 else Label.SIDEWALK
     plot.pave((x, x + DRIVE_WIDTH), (front, front + depth), label)
 
-    middle = x + DRIVE_WIDTH / 2
+    middle_x = x + DRIVE_WIDTH / 2
     if rng.random() < 0.4:
         car = cars.car(rng)
         distance = front + min(3.0, depth / 2)
-        plot.put(car, middle, distance, plot.side * np.pi / 2, thing=True, margin=3.0)
+        plot.put(car, middle_x, distance, plot.side * np.pi / 2, thing=True, margin=3.0)
     if rng.random() < 0.4:
-        plot.put(buildings.shed(rng), middle, front + depth + 3.0, plot.facing, margin=4.0)
+        plot.put(buildings.shed(rng), middle_x, front + depth + 3.0, plot.facing, margin=4.0)
 
 
 def fill_row(plot: Plot) -> None:
-    """Put one to three houses across the whole width of a plot, and pave the ground before them."""
+    """Put one to three adjoining houses on a plot, and pave the ground between them and the street.
+
+    The houses take the whole width of the plot.
+    """
     rng = plot.rng
     style = plot.style
     front = plot.front
@@ -112,7 +117,7 @@ def fill_row(plot: Plot) -> None:
     setback = rng.uniform(*style.setback)
     depth = rng.uniform(9, 14)
 
-    # Some rows step back from house to house, others are one long wall.
+    # A single house is one long wall. In a row of two or three, each house steps forward or back.
     houses = int(rng.choice([1, 2, 3], p=[0.6, 0.2, 0.2]))
     height = rng.uniform(*style.storeys)
     is_flat = rng.random() < 0.4

@@ -34,14 +34,14 @@ def analyze(
     Args:
         data: the dataset, with labels.
         weights: a weights file, or the name of built-in weights.
-        out: folder for the diagrams (PNG), and their figures (CSV).
+        out: folder for the diagrams (PNG), and the numbers that they show (CSV).
         choice: which scans to score.
         compute: where and how the networks are computed.
         neighbours: numbers of neighbours, separated by commas; a head is trained for each of them
             (Fig. 8b); needs --recipe.
-        taus: thresholds, separated by commas; a head is trained for each of them (Fig. 8a), for 1 a
-            head that learns from all points, not only uncertain ones; needs --recipe.
-        recipe: the recipe of these heads: the name of a built-in recipe, or a YAML file.
+        taus: thresholds, separated by commas; a head is trained for each of them (Fig. 8a); with
+            the threshold 1, the head learns from all points; needs --recipe.
+        recipe: the recipe that trains these heads: the name of a built-in recipe, or a YAML file.
         train_sequences: sequences or scenes that these heads learn from, separated by commas;
             default: the official split.
         overwrite: replace files that exist.
@@ -58,7 +58,8 @@ def analyze(
     from amvnet.training.plan import Plan
     from amvnet.weights.file import load
 
-    if (neighbours is None and taus is None) != (recipe is None):
+    has_values = neighbours is not None or taus is not None
+    if has_values != (recipe is not None):
         raise InputError(
             "expected --neighbours or --taus together with --recipe, found only one of them; "
             "give both or neither"
@@ -67,10 +68,10 @@ def analyze(
     dataset = normalised(open_dataset(data, loaded.taxonomy), normaliser_for(loaded))
     records = choice.records(dataset)
 
-    # Check this before any scan is scored, so that no time is wasted if the study cannot be made.
-    sweeps = {"neighbours": neighbours, "taus": taus}
-    sweep_names = [name for name, values in sweeps.items() if values]
-    outputs = charts.files_of(out, (*charts.FIGURES, *sweep_names), charts.TABLES)
+    # Check the outputs and the training scans first: scoring takes long, and would be for nothing
+    # if a head could not be trained or a file could not be written.
+    swept = [name for name, values in {"neighbours": neighbours, "taus": taus}.items() if values]
+    outputs = charts.files_of(out, (*charts.FIGURES, *swept), charts.TABLES)
     check_outputs(outputs, [data, weights, recipe], overwrite)
     plan = None
     if recipe is not None:
@@ -88,13 +89,15 @@ def analyze(
         model = loaded.model
         by_count = {count: with_neighbours(model, count) for count in sorted(set(neighbours or ()))}
         by_tau = {tau: with_tau(model, tau) for tau in sorted(set(taus or ()))}
-        studies = (
+        # Each sweep has the name of its option, the name of its axis, the value in the given
+        # weights, and a model for each value to train a head for.
+        sweeps = (
             ("neighbours", "neighbours", model.point_head.neighbours, by_count),
-            ("tau", "taus", model.assertion.threshold, by_tau),
+            ("taus", "tau", model.assertion.threshold, by_tau),
         )
-        for parameter, name, own_value, models in studies:
+        for option, axis, value_in_weights, models in sweeps:
             if models:
-                study = replace(plan, out=out / name)
-                rows = list(sweep_heads(study, models, loaded, segmenter.device))
-                written += charts.write_sweep(rows, parameter, own_value, data, out / name)
+                sweep_plan = replace(plan, out=out / option)
+                rows = list(sweep_heads(sweep_plan, models, loaded, segmenter.device))
+                written += charts.write_sweep(rows, axis, value_in_weights, data, out / option)
     report(f"{counted(len(written), 'file')} in {out}")

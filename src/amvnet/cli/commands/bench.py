@@ -30,8 +30,8 @@ def bench(
             quartiles.
         tau: a point is uncertain if the cosine similarity of the two networks' probabilities is at
             most this value, in [0, 1]; default: the value in the weights.
-        json: also write the figures to this file.
-        overwrite: replace this file if it exists.
+        json: also write the results to this file.
+        overwrite: replace the file of --json if it exists.
     """
     from amvnet.cli.tables import timing_table
     from amvnet.data.datasets.simulated import simulate

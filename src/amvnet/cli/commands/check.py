@@ -13,7 +13,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
 
     Args:
         data: the dataset.
-        choice: which scans to check, besides the labelled scans of the test split.
+        choice: which scans to check in addition to the labelled scans of the test split.
     """
     from amvnet.cli.tables import contents_table, unknown_table
     from amvnet.data.check import check_scans
@@ -38,9 +38,10 @@ def check(data: str, /, choice: TrainingChoice) -> None:
         raise InputError(errors[0])
     if broken:
         found = counted(len(broken), "broken scan")
-        them = "it" if len(broken) == 1 else "them"
+        pronoun = "it" if len(broken) == 1 else "them"
         raise SomeBroken(
-            f"expected scans that can be read, found {found}; correct {them} or leave {them} out",
+            f"expected scans that can be read, found {found}; correct {pronoun} or leave {pronoun} "
+            "out",
             list(broken.values()),
         )
     scans = sum(len(split.scans) for split in checked.splits.values())

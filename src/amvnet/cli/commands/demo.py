@@ -45,7 +45,8 @@ def demo(
             f"simulated streets have, found {', '.join(classes)[:200]}; use amvnet view and "
             "amvnet evaluate on scans with these classes"
         )
-    # Each seed has its own folder, because scans in one folder are taken for one dataset.
+    # Each seed has its own folder: in a common folder, streets of several seeds would be read as
+    # one dataset.
     data = out / "data" / f"{sensors[0]}-{seed}"
     with progress("simulating") as step:
         simulate(
