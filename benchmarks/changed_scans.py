@@ -1,13 +1,13 @@
-"""Measure the loss of accuracy by units, frames and intensities of other tools.
+"""Measure how much accuracy is lost on scans with the units, frames or intensities of other tools.
 
     python benchmarks/changed_scans.py DATA [WEIGHTS] [--scans 10]
 
 DATA is a dataset in the layout of SemanticKITTI, such as semantickitti:PATH. The scans are spread
-evenly over its sequences. Each scan is changed, and then labelled as `amvnet predict` labels a file
-of it. This is done without options at first. If scans are refused, or more than a tenth of the
-accuracy is lost, it is repeated with the option that undoes the change. Offsets are always tried,
-because they must not harm. The table shows the accuracy, and its share of the accuracy on unchanged
-scans.
+evenly over its sequences. Each scan is changed, and then labelled as if `amvnet predict` read it
+from a file. At first, `predict` gets no options. If a scan is refused, or more than a tenth of the
+accuracy is lost, the measurement is repeated with the option that undoes the change. The option
+`--offset` is measured even where nothing is lost, because it must do no harm. The table shows the
+accuracy, and its share of the accuracy on unchanged scans.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.lidars import AXES, KNOWN_HEIGHTS, make_sensor, rotation_from_degrees
 
 GOAL = 0.9  # least share of the accuracy on unchanged scans
-HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # height of the sensor above the ground, metres
+HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # height of the HDL-64E above the ground, metres
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,10 @@ class Change:
 
     Attributes:
         title: the title of the row in the table.
-        apply: a function that returns the changed cloud of (N, 3) coordinates and (N,) intensities.
-        options: the options of `amvnet predict` that undo the change, as attributes of a `Sensor`.
+        apply: a function that takes (N, 3) coordinates and (N,) intensities, and returns the
+            changed cloud.
+        options: the options of `amvnet predict` that undo the change, by the names that the
+            attributes of `Sensor` have.
     """
 
     title: str
@@ -55,7 +57,7 @@ def turned(matrix: np.ndarray) -> Callable[[np.ndarray, np.ndarray], Cloud]:
 
 
 def tilted(pitch: float, roll: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
-    """Return a change that turns a scan by some angles, degrees."""
+    """Return a change that turns a scan by a pitch and a roll, degrees."""
     return turned(rotation_from_degrees(0, pitch, roll))
 
 
@@ -71,8 +73,8 @@ def scaled(factor: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
     return lambda xyz, intensity: Cloud(xyz, intensity * np.float32(factor))
 
 
-def lifted(x: float, z: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
-    """Return a change that moves a scan by some distances, metres."""
+def moved(x: float, z: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
+    """Return a change that moves a scan forward by x and up by z, metres."""
     return lambda xyz, intensity: Cloud(xyz + np.array([x, 0, z], xyz.dtype), intensity)
 
 
@@ -92,8 +94,12 @@ CHANGES = (
         {"intensity_scale": 6000},
     ),
     Change("one intensity of 300", with_outlier, {"intensity_scale": 1}),
-    Change("origin on the ground", lifted(0, HEIGHT), {"offset": (0, 0, -HEIGHT)}),
-    Change("the same, 1 m behind", lifted(1, HEIGHT), {"offset": (-1, 0, -HEIGHT)}),
+    Change("origin on the ground", moved(0, HEIGHT), {"offset": (0, 0, -HEIGHT)}),
+    Change(
+        "origin on the ground, 1 m behind the sensor",
+        moved(1, HEIGHT),
+        {"offset": (-1, 0, -HEIGHT)},
+    ),
     Change("8 degrees of pitch", tilted(8, 0), {"rotate": (0, -8, 0)}),
     Change("8 degrees of roll", tilted(0, 8), {"rotate": (0, 0, -8)}),
     Change("upside-down", turned(np.diag([1.0, -1.0, -1.0])), {"axes": "z-down"}),
@@ -109,18 +115,22 @@ class Outcome:
     """The result of labelling changed scans.
 
     Attributes:
-        accuracies: share of the labelled points that are right, of each scan that was not refused.
+        accuracies: for each scan that was not refused, the share of its labelled points that got
+            the right label.
         refusal: the message of the last scan that was refused; empty if none was.
-        said: what was assumed of the last scan.
+        assumptions: what `predict` would report that it assumed about the last scan.
     """
 
     accuracies: list[float]
     refusal: str = ""
-    said: str = ""
+    assumptions: str = ""
 
 
 class Labeller:
-    """Labels normalised scans, and equal scans only once: many changes are undone exactly."""
+    """Labels normalised scans.
+
+    Normalising undoes many changes exactly, and the same scan results. It is labelled only once.
+    """
 
     def __init__(self, weights: str) -> None:
         self.segmenter = amvnet.load(weights)
@@ -141,13 +151,13 @@ def measure(
     change: Change, options: dict[str, Any], scans: list[Scan], labeller: Labeller
 ) -> Outcome:
     """Label changed scans, each as if it were alone in its folder."""
-    lines: list[str] = [""]
+    reported = [""]  # the lines that normalisers report; empty if no line comes
     refusal = ""
     accuracies = []
     for scan in scans:
         cloud = change.apply(scan.points[:, :3], scan.points[:, 3])
         normaliser = normaliser_for(
-            labeller.segmenter.weights, make_sensor(**options), lines.append
+            labeller.segmenter.weights, make_sensor(**options), reported.append
         )
         try:
             labels = labeller(normaliser(cloud, scan.name))
@@ -158,11 +168,11 @@ def measure(
         assert scan.labels is not None
         is_labelled = scan.labels > 0
         accuracies.append(float(np.mean(labels[is_labelled] == scan.labels[is_labelled])))
-    return Outcome(accuracies, refusal, lines[-1])
+    return Outcome(accuracies, refusal, reported[-1])
 
 
 def cell(outcome: Outcome, unchanged: float) -> str:
-    """Return accuracy and its share of the accuracy on the unchanged scans, both in percent."""
+    """Return the accuracy, and in brackets its share of the accuracy on unchanged scans."""
     text = ""
     if outcome.accuracies:
         accuracy = 100 * float(np.mean(outcome.accuracies))
@@ -173,7 +183,7 @@ def cell(outcome: Outcome, unchanged: float) -> str:
 
 
 def main() -> None:
-    """Print the table, and below it the lines that were reported about the last scan."""
+    """Print the table, and below it for each change the line that was reported about a scan."""
     parser = argparse.ArgumentParser()
     parser.add_argument("data")
     parser.add_argument("weights", nargs="?", default="sim-hdl64e")
@@ -194,17 +204,17 @@ def main() -> None:
         if options.only and change.title not in ("unchanged", *options.only):
             continue
 
-        alone = measure(change, {}, scans, labeller)
-        accuracy = 100 * float(np.mean(alone.accuracies or [0]))
-        unchanged = unchanged or accuracy
-        row = [change.title, cell(alone, unchanged), "", ""]
-        is_mended = not alone.refusal and accuracy > GOAL * unchanged
-        if change.options and (not is_mended or "offset" in change.options):
-            mended = measure(change, change.options, scans, labeller)
-            row[2:] = [name_option(change.options), cell(mended, unchanged)]
+        without_options = measure(change, {}, scans, labeller)
+        accuracy = 100 * float(np.mean(without_options.accuracies or [0]))
+        unchanged = unchanged or accuracy  # the first row has the unchanged scans
+        row = [change.title, cell(without_options, unchanged), "", ""]
+        is_good = not without_options.refusal and accuracy > GOAL * unchanged
+        if change.options and (not is_good or "offset" in change.options):
+            with_option = measure(change, change.options, scans, labeller)
+            row[2:] = [name_option(change.options), cell(with_option, unchanged)]
 
         table.add_row(*row)
-        remarks.append(f"{change.title}: {alone.refusal or alone.said}")
+        remarks.append(f"{change.title}: {without_options.refusal or without_options.assumptions}")
         print(*row, sep=" | ", flush=True)
 
     console = Console(width=150)
@@ -214,7 +224,7 @@ def main() -> None:
 
 
 def name_option(options: dict[str, Any]) -> str:
-    """Return the text of some options on the command line."""
+    """Return options as the user would type them on the command line."""
     words = []
     for key, value in options.items():
         text = ",".join(f"{number:g}" for number in value) if isinstance(value, tuple) else value

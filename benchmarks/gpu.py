@@ -64,10 +64,10 @@ TINY = ModelConfig(
 SIZES = {"paper": "semantickitti", "compact": "semantickitti-compact"}
 UNCERTAIN = 0.1  # share of uncertain points, as in the paper
 WARM_UP = 3  # number of runs that do not count; the first one captures the graphs
-# Sizes of the training.
+# The training that is measured:
 STEP = 8  # number of scans in a step
-WORKERS = 6
-EPOCHS = (1, 3)  # numbers of epochs of two runs, whose difference in time is measured
+WORKERS = 6  # number of processes that load scans
+EPOCHS = (1, 3)  # a run of one epoch and a run of three; their times are subtracted
 
 
 class Options(argparse.Namespace):
@@ -114,7 +114,7 @@ def main() -> None:
 
 
 def untrained(recipe: Recipe) -> Weights:
-    """Return random weights with the sizes of a recipe."""
+    """Return random weights of networks and a head with the sizes of a recipe."""
     taxonomy = TAXONOMIES[recipe.taxonomy]
     model = build_amvnet(recipe.model, taxonomy.size)
     tensors: dict[str, torch.Tensor] = {}
@@ -146,11 +146,11 @@ def measure_size(size: str, weights: Weights, scan: Scan, options: Options) -> N
     for precision in options.precision.split(","):
         for graphs in (False, True):
             segmenter = make_segmenter(weights, scan, precision, graphs, options)
-            way = f"{precision}, {'graphs' if graphs else 'one by one'}"
+            variant = f"{precision}, {'graphs' if graphs else 'one by one'}"
             for batch in map(int, options.batch.split(",")):
-                rows.append([way, batch, *time_batch(segmenter, [scan] * batch, options)])
-            stages[way] = time_stages(segmenter, scan, options)
-            waits = count_waits(segmenter, scan)
+                rows.append([variant, batch, *time_batch(segmenter, [scan] * batch, options)])
+            stages[variant] = time_stages(segmenter, scan, options)
+            waits = count_waits(segmenter, scan)  # the table has the waits of the last variant
 
     header = ["networks", "at a time", "scans/s", "ms a scan", "launches", "kernels", "busy, ms"]
     header.append("memory, GiB")
@@ -167,7 +167,8 @@ def make_segmenter(
 ) -> Segmenter:
     """Return a segmenter for which the share `UNCERTAIN` of the scan's points is uncertain.
 
-    Untrained networks would disagree on another share than trained ones.
+    Random networks disagree on more or fewer points than trained networks do. The threshold of the
+    assertion is therefore set by the similarities in this scan.
     """
     segmenter = load(
         weights,
@@ -187,13 +188,15 @@ def make_segmenter(
 
 
 def time_batch(segmenter: Segmenter, scans: Sequence[Scan], options: Options) -> list[str]:
-    """Return scans a second, and for each scan ms, launches, kernels and their ms; and memory.
+    """Return one row of the table: the columns after the networks and the batch.
 
-    A graph is one launch of many kernels. On a CPU, operators count as kernels.
+    The columns are the scans per second; the milliseconds, launches and kernels of each scan; the
+    milliseconds that the GPU is busy with a scan; and the largest memory. A graph is one launch of
+    many kernels. On a CPU, operators count as kernels.
     """
     is_gpu = options.device != "cpu"
     memory = ""
-    busy_time = ""
+    busy = ""
     if is_gpu:
         torch.cuda.reset_peak_memory_stats(options.device)
     seconds = median_seconds(lambda: segmenter.many(scans), options) / len(scans)
@@ -207,11 +210,11 @@ def time_batch(segmenter: Segmenter, scans: Sequence[Scan], options: Options) ->
     kernels = [event for event in events if event.device_type == kind]
 
     if is_gpu:
-        busy = sum(event.self_device_time_total for event in kernels) / 1e3
-        busy_time = f"{busy / len(scans):.1f}"
+        busy_ms = sum(event.self_device_time_total for event in kernels) / 1e3
+        busy = f"{busy_ms / len(scans):.1f}"
         memory = f"{torch.cuda.max_memory_allocated(options.device) / 2**30:.1f}"
     counts = [str(count // len(scans)) for count in (launches, len(kernels))]
-    return [f"{1 / seconds:.1f}", f"{seconds * 1e3:.1f}", *counts, busy_time, memory]
+    return [f"{1 / seconds:.1f}", f"{seconds * 1e3:.1f}", *counts, busy, memory]
 
 
 def time_stages(segmenter: Segmenter, scan: Scan, options: Options) -> dict[str, float]:
@@ -226,7 +229,7 @@ def time_stages(segmenter: Segmenter, scan: Scan, options: Options) -> dict[str,
 
 
 def count_waits(segmenter: Segmenter, scan: Scan) -> Counter[str]:
-    """Return the lines at which the processor waits for the GPU in one scan, and how often."""
+    """Return the lines of code at which the processor waits for the GPU, and how often it waits."""
     if segmenter.device == "cpu":
         return Counter()
     torch.cuda.set_sync_debug_mode("warn")
@@ -242,7 +245,10 @@ def count_waits(segmenter: Segmenter, scan: Scan) -> Counter[str]:
 
 
 def measure_predict(size: str, weights: Weights, folder: Path, options: Options) -> None:
-    """Print the scans per second of `predict` from disk, without its start."""
+    """Print the scans per second of `predict` from disk, without the time of its start.
+
+    The start takes the same time for few scans as for all scans, and is subtracted.
+    """
     path = save(weights, folder / f"{size}.safetensors")
     city = folder / "city"
     scans = len(list(city.glob("sequences/*/velodyne/*")))
@@ -252,16 +258,21 @@ def measure_predict(size: str, weights: Weights, folder: Path, options: Options)
     for batch in map(int, options.batch.split(",")):
         common = ["--weights", path, "--device", options.device, "--batch", batch]
         out = folder / f"{size}-{batch}"
-        start = run_amvnet("predict", city, *common, "--sequences", "00", "--out", f"{out}-few")
-        whole = run_amvnet("predict", city, *common, "--out", out)
-        rows.append([batch, rate_of(scans - few, whole - start)])
+        few_seconds = run_amvnet(
+            "predict", city, *common, "--sequences", "00", "--out", f"{out}-few"
+        )
+        all_seconds = run_amvnet("predict", city, *common, "--out", out)
+        rows.append([batch, rate_of(scans - few, all_seconds - few_seconds)])
     print_table(f"{size}: predict from disk", ["at a time", "scans/s"], rows)
 
 
 def measure_training(folder: Path, options: Options) -> None:
-    """Print the scans per second of training with loaders, without the first epoch."""
+    """Print the scans per second of training with loaders, after the first epoch.
+
+    Two trainings differ only in the number of epochs, and their times are subtracted.
+    """
     batch, workers, epochs = (2, 0, (1, 2)) if options.quick else (STEP, WORKERS, EPOCHS)
-    names = ("rv",) if options.quick else ("rv", "bev")
+    networks = ("rv",) if options.quick else ("rv", "bev")
     recipe: Path | str = "simulated-compact"
     if options.quick:
         recipe = folder / "tiny.yaml"
@@ -269,7 +280,7 @@ def measure_training(folder: Path, options: Options) -> None:
     accelerator = "cpu" if options.device == "cpu" else "gpu"
 
     rows = []
-    for stage in names:
+    for stage in networks:
         seconds = []
         for count in epochs:
             seconds.append(
@@ -286,12 +297,14 @@ def measure_training(folder: Path, options: Options) -> None:
         scans = len(list((folder / "city").glob("sequences/0[012]/velodyne/*")))
         rows.append([stage, rate_of((epochs[1] - epochs[0]) * scans, seconds[1] - seconds[0])])
 
-    title = f"training of {Path(recipe).stem}, {batch} scans a step, {workers} workers, validation"
-    print_table(f"{title} included", ["network", "scans/s"], rows)
+    title = (
+        f"training and validation of {Path(recipe).stem}, {batch} scans a step, {workers} workers"
+    )
+    print_table(title, ["network", "scans/s"], rows)
 
 
 def run_amvnet(*words: object) -> float:
-    """Run a command of amvnet in this process without its output; return its seconds."""
+    """Run a command of amvnet in this process, and hide its output; return the seconds it took."""
     started = time.perf_counter()
     with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stdout(nowhere):
         code = amvnet([str(word) for word in words])
@@ -308,7 +321,7 @@ def rate_of(count: int, seconds: float) -> str:
 
 
 def median_seconds(work: Callable[[], object], options: Options) -> float:
-    """Return the median time of some runs, after runs that only warm up."""
+    """Return the median time of `options.runs` runs, after runs that only warm up."""
     times = []
     for _ in range(WARM_UP + options.runs):
         started = time.perf_counter()

@@ -17,9 +17,9 @@ CLASSES = 20
 
 
 class Unit(nn.Sequential):
-    """Convolution, leaky ReLU, batch norm.
+    """A convolution, then a leaky ReLU, then a batch norm.
 
-    In this order the norm cannot be folded into the convolution.
+    In this order, the norm cannot be folded into the convolution before it.
     """
 
     def __init__(
@@ -30,7 +30,10 @@ class Unit(nn.Sequential):
 
 
 class Context(nn.Module):
-    """The contextual module at full resolution: 3 x 3 and 3 x 3 dilated, added to a shortcut."""
+    """The contextual module at full resolution: two 3 x 3 convolutions, added to a shortcut.
+
+    The second convolution is dilated.
+    """
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -44,9 +47,9 @@ class Context(nn.Module):
 
 
 class Dilated(nn.Module):
-    """Three convolutions in sequence, and a 1 x 1 convolution over the results of all three.
+    """Three convolutions in sequence, and a 1 x 1 convolution that joins their three results.
 
-    The three are 3 x 3, 3 x 3 dilated, and 2 x 2 dilated.
+    The first one is 3 x 3, the second one 3 x 3 and dilated, the third one 2 x 2 and dilated.
     """
 
     def __init__(self, channels: int, out: int) -> None:
@@ -62,8 +65,8 @@ class Dilated(nn.Module):
         return self.joined(torch.cat([first, second, self.third(second)], dim=1))
 
 
-class Encoder(nn.Module):
-    """A dilated block with a shortcut. The decoder takes its output before pooling."""
+class EncoderStage(nn.Module):
+    """One stage of the encoder: a dilated block with a shortcut. `SalsaNext` pools its output."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -77,8 +80,8 @@ class Encoder(nn.Module):
 class SalsaNext(nn.Module):
     """Range image (B, 5, H, W) -> logits (B, 20, H, W).
 
-    Like the paper's network it has 6.7 million parameters, and takes 62.3 billion multiply-adds at
-    64 x 2048.
+    Like the paper's network, it has 6.7 million parameters. On an image of 64 x 2048, it takes 62.3
+    billion multiply-adds.
     """
 
     def __init__(self) -> None:
@@ -87,9 +90,10 @@ class SalsaNext(nn.Module):
 
         self.encoders = nn.ModuleList()
         for channels, out in pairwise((32, 64, 128, 256, 256, 256)):
-            self.encoders.append(Encoder(channels, out))
+            self.encoders.append(EncoderStage(channels, out))
 
-        # The channels from the coarser map after its pixel shuffle, of the skip, and of the output
+        # Each decoder stage has three numbers of channels: in the coarser map after its pixel
+        # shuffle, in the encoder's map of the same size, and in the output.
         sizes = ((64, 256, 128), (32, 256, 128), (32, 128, 64), (16, 64, 32))
         self.decoders = nn.ModuleList()
         for coarse, skip, out in sizes:
@@ -100,9 +104,9 @@ class SalsaNext(nn.Module):
         x = self.context(image)
         skips = []
         for encoder in self.encoders[:-1]:
-            full = encoder(x)
-            skips.append(full)
-            x = F.avg_pool2d(full, 3, 2, 1)
+            before_pooling = encoder(x)
+            skips.append(before_pooling)
+            x = F.avg_pool2d(before_pooling, 3, 2, 1)
 
         x = self.encoders[-1](x)
         for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
