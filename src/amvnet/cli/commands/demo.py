@@ -19,10 +19,10 @@ def demo(
     """Simulate streets, segment them, score the labels, and write a page that shows them in 3D.
 
     Args:
-        out: folder for the scans, the page and the figures.
+        out: folder for the scans, the page (index.html) and the scores (metrics.json).
         seed: the seed of the streets; the built-in weights have not seen the default streets.
         weights: a weights file, or the name of built-in weights.
-        overwrite: replace the page and the figures if they exist.
+        overwrite: replace the page and the scores if they exist.
     """
     from amvnet import load
     from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR, simulate
@@ -58,4 +58,4 @@ def demo(
         shown = show_scans(scans, taxonomy, segmenter, progress=step)
         evaluation = write_page(page, shown, taxonomy, "Simulated streets")
     show_evaluation(evaluation, f"simulated streets, seed {seed}", metrics_path)
-    report(f"labelled scans in {data}, figures in {metrics_path}; open {page} in a browser")
+    report(f"labelled scans in {data}, scores in {metrics_path}; open {page} in a browser")
