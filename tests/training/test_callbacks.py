@@ -104,7 +104,8 @@ def test_a_network_has_the_averaged_weights_only_in_the_validation() -> None:
 
 def test_the_best_weights_are_the_first_with_the_highest_miou(tmp_path: Path) -> None:
     weights = fresh_weights()
-    module: Any = SimpleNamespace(trained=weights.build().range_net, check_epoch=lambda: None)
+    range_net = weights.build().range_net
+    module: Any = SimpleNamespace(trained=range_net, check_epoch=lambda: None, own_miou=None)
     keep = object.__new__(KeepWeights)
     keep.folder = tmp_path
     keep.part = "range_net"

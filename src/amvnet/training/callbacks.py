@@ -99,8 +99,8 @@ class AverageWeights(Callback):
 class KeepWeights(Callback):
     """Writes last.safetensors, best.safetensors and `SETTINGS` of a stage after each epoch.
 
-    The best weights are the weights with the highest mIoU in the validation. If nothing is
-    validated, they are the last ones.
+    The best weights are the weights with the highest mIoU in the validation, which is the stage's
+    `own_miou` if it has one. If nothing is validated, they are the last ones.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class KeepWeights(Callback):
                 metrics[name] = value
         metrics["epoch"] = trainer.current_epoch
 
-        miou = metrics.get("val/miou")
+        miou = metrics.get("val/miou") if pl_module.own_miou is None else pl_module.own_miou
         is_best = miou is None or miou > self.highest
         if miou is not None:
             self.highest = max(self.highest, miou)

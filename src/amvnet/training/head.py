@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 
 from amvnet.config.schema import HeadTraining
 from amvnet.errors import InputError
+from amvnet.evaluation.metrics import metrics
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.point_head import PointHead
 from amvnet.sensors.intensity import trained_intensity
@@ -65,10 +66,6 @@ class HeadStage(Stage):
         point, rows, labels, stands_for = batch
         prediction = self.trained(point, rows).argmax(dim=1) + 1
 
-        # Where the networks agree, AMVNet's labels are the ensemble's.
-        if self.val_points is not None and not self.val_points.are_uncertain:
-            return
-
         # Each point counts as many times as the number of points that it stands for.
         size = len(self.matrix)
         cells = (labels * size + prediction).cpu().numpy()
@@ -78,12 +75,16 @@ class HeadStage(Stage):
     def whole_matrix(self) -> NDArray[np.float64]:
         """Return AMVNet's confusion matrix: the head's, plus the ensemble's for certain points."""
         assert self.val_points is not None
-        total: NDArray[np.float64] = super().whole_matrix() + self.val_points.certain
-        return total
+        certain: NDArray[np.float64] = self.val_points.certain
+        if self.val_points.are_uncertain:
+            return super().whole_matrix() + certain
+        return certain  # where the networks agree, AMVNet's labels are the ensemble's
 
     def on_validation_epoch_end(self) -> None:
         super().on_validation_epoch_end()
         assert self.val_points is not None
+        if not self.val_points.are_uncertain:  # AMVNet's mIoU says nothing about the head
+            self.own_miou = metrics(super().whole_matrix(), self.taxonomy)["miou"] or 0.0
         self.log("train/uncertain", self.train_points.uncertain_share)
         self.log(UNCERTAIN, self.val_points.uncertain_share)
 

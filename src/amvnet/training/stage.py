@@ -67,6 +67,9 @@ class Stage(L.LightningModule):
     trained: nn.Module  # the part of the model that this stage trains
     in_float32 = False  # whether the stage ignores the precision of the recipe
 
+    # The mIoU that chooses the best weights, if `val/miou` does not depend on the trained part.
+    own_miou: float | None = None
+
     def __init__(
         self,
         config: NetworkTraining | HeadTraining,
