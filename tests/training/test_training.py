@@ -618,7 +618,7 @@ def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
     mious = column(tmp_path / "run", "head", "val/miou")
     assert mious[-1] == pytest.approx(expected, abs=1e-3)
 
-    # AMVNet's figure is the same after each epoch, so the head's own labels choose its best weights.
+    # AMVNet's figure never changes, so the head's own labels choose its best weights.
     assert len(set(mious)) == 1
     best = load(tmp_path / "run/head/best.safetensors")
     assert best.metrics["point_head"]["epoch"] == len(mious) - 1
