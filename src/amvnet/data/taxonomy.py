@@ -258,6 +258,10 @@ def class_entries(classes: Any, key: str, example: str) -> dict[str, dict[str, A
                 f"classes: expected texts as names, found the value {shown(title)}, as YAML reads "
                 "numbers, no, off, on, yes and null; write the name in quotes"
             )
+        if not title.strip():
+            raise InputError(
+                f"classes: expected names with letters, found {shown(title)}; name the class"
+            )
         values = dict(entry) if isinstance(entry, Mapping) else {key: entry}
         color = values.get("color")
         if color is None:

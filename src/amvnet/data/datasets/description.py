@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,7 @@ KEYS = (
 )
 SPLITS = ("train", "val", "test")
 WILDCARDS = set("*?[")  # characters of patterns
+PLACEHOLDER = re.compile(r"\{\w*\}")
 REST = "rest"  # among the ignored ids: all ids that the file does not name
 
 
@@ -189,8 +191,13 @@ def _parse_labels(entry: Any) -> LabelPlace | None:
     if file is None and column is None:
         raise InputError("labels: expected a file or a field, found neither; name one")
 
+    others = set(PLACEHOLDER.findall(file or "")) - {"{name}"}
+    if others:
+        raise InputError(
+            f"labels: expected {{name}} for the scan's name, found {min(others)}; correct it"
+        )
     if file is not None and "{name}" not in file:
-        if not file.startswith("."):
+        if not file.startswith(".") or "/" in file:  # no ending, such as .label
             raise InputError(
                 f"labels: expected the scan's name in the file, found {file!r}; "
                 "write for example ../labels/{name}.label"
