@@ -15,6 +15,7 @@ from lidarstreets.sensing.sensors import LidarModel, draw_device, sensor_of
 from lidarstreets.sites.populate import populate
 from lidarstreets.sites.site import MOVING_CLEARANCE, Site, covers
 from lidarstreets.streets.ground import Ground
+from lidarstreets.streets.regions import REGIONS
 from lidarstreets.streets.styles import draw_style
 
 SIGHT_DISTANCE = 90.0  # largest distance of a visible moving body, metres along the street
@@ -71,7 +72,7 @@ def _drive_one_street(
     sensor: LidarModel, lasers: Lasers, scans: int, rng: np.random.Generator, drive: Drive
 ) -> Iterator[SimulatedScan]:
     """Yield the scans of one street; their poses are relative to the first scan."""
-    style = draw_style(rng)
+    style = draw_style(rng, REGIONS[sensor.region])
     end = drive.margin + scans * drive.spacing
     ground = Ground(style, end + drive.margin, rng, (drive.margin, end))
     speed = float(rng.uniform(*drive.speed)) * style.speed

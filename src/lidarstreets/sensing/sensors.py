@@ -52,6 +52,8 @@ class LidarModel:
     keeps_lost_returns: bool
     # Layout of the files, a key of `LAYOUTS`.
     layout: str
+    # Where the sensor drives, a key of `REGIONS`.
+    region: str
     # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
     shadow: tuple[tuple[float, float, float, float], ...]
     # Share of the returns that are lost, whatever they hit, 0 to 1.

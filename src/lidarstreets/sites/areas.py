@@ -79,7 +79,7 @@ def add_lot(area: Plot, depth: float) -> None:
 
     for row in rows:
         for x in np.arange(area.x + 1.8, area.end - 1.5, pitch):
-            mesh = choose_vehicle(rng, "lot")(rng)
+            mesh = choose_vehicle(area.site, "lot")(rng)
             distance = front + row + rng.normal(scale=0.2)
             yaw = angle + np.pi * (rng.random() < 0.5) + rng.normal(scale=0.03)
             if rng.random() < 0.07:
@@ -123,7 +123,7 @@ def _put_large(area: Plot, x: float, distance: float, heading: float) -> float:
         return size[0]
 
     has_trailer = rng.random() < 0.12
-    bodies = car_with_trailer(rng) if has_trailer else [choose_vehicle(rng, "yard")(rng)]
+    bodies = car_with_trailer(rng) if has_trailer else [choose_vehicle(area.site, "yard")(rng)]
     length = sum(length_of(body) for body in bodies)
     for body in bodies:
         area.put(body, x + length / 2, distance, yaw, thing=True, margin=-np.inf)

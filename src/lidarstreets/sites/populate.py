@@ -140,7 +140,8 @@ def _add_work_zones(site: Site) -> None:
     rng = site.rng
     ground = site.ground
 
-    for _ in range(rng.poisson(WORK_ZONES_PER_100_M * ground.length / 100)):
+    rate = WORK_ZONES_PER_100_M * ground.style.region.work_zones
+    for _ in range(rng.poisson(rate * ground.length / 100)):
         side = int(rng.choice([-1, 1]))
         start = rng.uniform(0, ground.length)
         edge = side * (ground.kerb_t(side) - 0.4)

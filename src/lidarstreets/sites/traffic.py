@@ -12,6 +12,7 @@ from lidarstreets.materials import Label
 from lidarstreets.mesh import Maker, Mesh, join, place
 from lidarstreets.sites.site import Site
 from lidarstreets.streets.plans import SideRoad
+from lidarstreets.streets.regions import scaled
 from lidarstreets.tables import read_table
 
 VEHICLE_SHARES = read_table(Path(__file__).with_suffix(".toml"))
@@ -30,9 +31,10 @@ BUMPER_GAP = 2.0  # smallest distance between two vehicles in a lane, bumper to 
 LONGEST_ANGLED = 5.8  # length of the longest vehicle that parks at an angle to the street, metres
 
 
-def choose_vehicle(rng: np.random.Generator, where: str) -> Maker:
+def choose_vehicle(site: Site, where: str) -> Maker:
     """Draw a kind of vehicle and return its maker; `where` is a table of traffic.toml."""
-    return VEHICLE_MAKERS[weighted_choice(rng, VEHICLE_SHARES[where])]
+    shares = scaled(VEHICLE_SHARES[where], site.ground.style.region.vehicles)
+    return VEHICLE_MAKERS[weighted_choice(site.rng, shares)]
 
 
 def length_of(mesh: Mesh) -> float:
@@ -62,7 +64,7 @@ def _fill_parallel(site: Site, side: int) -> None:
     x = rng.uniform(0, 6)
 
     while x < ground.length:
-        mesh = choose_vehicle(rng, "parked")(rng)
+        mesh = choose_vehicle(site, "parked")(rng)
         half = length_of(mesh) / 2 + rng.uniform(0.2, 1.0)
         middle = x + half
         if rng.random() < style.parked and _is_bay(site, middle, half):
@@ -83,7 +85,7 @@ def _fill_angled(site: Site, side: int, angle: float) -> None:
     pitch = rng.uniform(2.4, 2.9) / np.sin(angle)
 
     for x in np.arange(rng.uniform(0, 3), ground.length, pitch):
-        mesh = choose_vehicle(rng, "parked")(rng)
+        mesh = choose_vehicle(site, "parked")(rng)
         half = length_of(mesh) / 2
         is_taken = rng.random() < style.parked
         if is_taken and 2 * half < LONGEST_ANGLED and _is_bay(site, x, 1.0):
@@ -112,7 +114,7 @@ def park_anywhere(site: Site, side: int) -> None:
     for start in np.arange(0.0, ground.length, 100.0):
         x = start + rng.uniform(0, 30)
         for _ in range(rng.poisson(rate)):
-            mesh = choose_vehicle(rng, "parked")(rng)
+            mesh = choose_vehicle(site, "parked")(rng)
             half = length_of(mesh) / 2
             x += half + rng.uniform(0.5, 8.0)
             # From the edge of the road to the back of the sidewalk.
@@ -132,14 +134,14 @@ def fill_side_roads(site: Site) -> None:
     for road in site.ground.plan.crossings:
         distance = site.ground.style.road / 2 + rng.uniform(3.5, 12)
         for _ in range(rng.poisson(0.7)):
-            mesh = choose_vehicle(rng, "driving")(rng)
+            mesh = choose_vehicle(site, "driving")(rng)
             half = length_of(mesh) / 2
             _put_on_side_road(site, road, mesh, distance + half, road.width / 4)
             distance += 2 * half + rng.uniform(1, 8)
 
         distance = site.ground.style.road / 2 + rng.uniform(8, 20)
         for _ in range(rng.poisson(0.8 * (road.width > 5.5))):
-            mesh = choose_vehicle(rng, "parked")(rng)
+            mesh = choose_vehicle(site, "parked")(rng)
             half = length_of(mesh) / 2
             across = -(road.width / 2 + rng.uniform(-1.0, 0.6))
             _put_on_side_road(site, road, mesh, distance + half, across)
@@ -183,7 +185,7 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
         clearance = 4.5 if rng.random() < 0.15 else 11.0
         x = rng.uniform(5, 40)
         while True:
-            mesh = choose_vehicle(rng, where)(rng)
+            mesh = choose_vehicle(site, where)(rng)
             half = length_of(mesh) / 2
             x += half
             if x > ground.length - half - BUMPER_GAP:

@@ -27,7 +27,7 @@ def _car_park(plot: Plot) -> None:
 
     for row in (4.0, 14.5):
         for x in np.arange(plot.x + 3, plot.end - 3, 2.8):
-            make = choose_vehicle(rng, "car park")
+            make = choose_vehicle(plot.site, "car park")
             is_taken = rng.random() < chance
             has_room = make is not trucks.truck or row > 10  # trucks are too long for the front
             if is_taken and has_room:
@@ -89,7 +89,7 @@ def _industrial_yard(plot: Plot) -> None:
         plot.put(thing, plot.random_x(), front + rng.uniform(1, 13), rng.uniform(0, 6))
 
     for _ in range(rng.poisson(1.5)):
-        make = choose_vehicle(rng, "car park")
+        make = choose_vehicle(plot.site, "car park")
         yaw = rng.choice([-1, 1]) * np.pi / 2
         plot.put(make(rng), plot.random_x(), front + 9, yaw, thing=True, margin=7.0)
     if rng.random() < 0.3:

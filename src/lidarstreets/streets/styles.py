@@ -8,6 +8,7 @@ import numpy as np
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label
 from lidarstreets.streets.kinds import STREET_KINDS, Kind, Surroundings
+from lidarstreets.streets.regions import Region, scaled
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ class Style(Surroundings):
 
     # Kind of street, a key of `STREET_KINDS`.
     kind: str
+    # The region of the street.
+    region: Region
     # Width of the carriageway, with the median.
     road: float
     # Width of the median, the middle of the road that no lane uses; 0 if there is none.
@@ -88,11 +91,13 @@ class Style(Surroundings):
     painted: bool
 
 
-def draw_style(rng: np.random.Generator) -> Style:
-    """Draw a kind of street, and vary its typical numbers."""
+def draw_style(rng: np.random.Generator, region: Region) -> Style:
+    """Draw a kind of street of a region, and vary its typical numbers."""
     shares = {name: kind.share for name, kind in STREET_KINDS.items()}
-    name = weighted_choice(rng, shares)
+    name = weighted_choice(rng, scaled(shares, region.kinds))
     kind = STREET_KINDS[name]
+    sides = scaled(kind.sides, region.sides)
+    lowest, highest = kind.storeys
 
     # The chances vary around the chances of the kind. A factor above 8 would make them vary less.
     # The small number is there because a Dirichlet distribution does not allow 0.
@@ -108,6 +113,7 @@ def draw_style(rng: np.random.Generator) -> Style:
 
     return Style(
         kind=name,
+        region=region,
         road=road,
         median=median,
         median_label=_draw_median_label(rng, has_long_median),
@@ -117,16 +123,16 @@ def draw_style(rng: np.random.Generator) -> Style:
         is_bus_bay=is_bus_bay,
         parking_angle=angles,
         parking_period=float(rng.uniform(9, 40)) if rng.random() < 0.4 else np.inf,
-        strips=(_draw_strips(rng, kind.sides), _draw_strips(rng, kind.sides)),
+        strips=(_draw_strips(rng, sides), _draw_strips(rng, sides)),
         kerb=float(rng.uniform(0.0, 0.03) if is_flush else rng.uniform(0.03, 0.18)),
         bank=(_draw_bank(rng, kind.relief), _draw_bank(rng, kind.relief)),
         plots=(house, row, wood, field, lot),
         setback=kind.setback,
-        storeys=kind.storeys,
+        storeys=(lowest * region.storeys, highest * region.storeys),
         parked=kind.parked * rng.uniform(0.3, 1.5),
         trees=kind.trees * rng.uniform(0.6, 2.0) if rng.random() < 0.6 else np.inf,
         fenced=kind.fenced * rng.uniform(0.5, 1.3),
-        traffic=kind.traffic * rng.uniform(0.3, 1.7),
+        traffic=region.traffic * kind.traffic * rng.uniform(0.3, 1.7),
         speed=kind.speed * rng.uniform(0.8, 1.2),
         people=kind.people * rng.uniform(0.2, 2.0),
         green=kind.green * rng.uniform(0.5, 1.6),

@@ -12,6 +12,7 @@ from lidarstreets.sites.background import line_side_road
 from lidarstreets.sites.boundaries import Boundary
 from lidarstreets.sites.site import Site
 from lidarstreets.streets.ground import Ground
+from lidarstreets.streets.regions import Region
 from lidarstreets.streets.styles import draw_style
 
 LOW = 0.5
@@ -29,7 +30,7 @@ def test_side_roads_have_all_layers_of_a_boundary(monkeypatch: pytest.MonkeyPatc
     rng = np.random.default_rng(0)
     heights = []
     for _ in range(6):
-        ground = Ground(draw_style(rng), 120.0, rng, (40.0, 80.0))
+        ground = Ground(draw_style(rng, Region()), 120.0, rng, (40.0, 80.0))
         site = Site(ground, rng)
         for road in ground.plan.crossings:
             for side in (-1, 1):

@@ -15,6 +15,7 @@ from lidarstreets.materials import MOVING, Label
 from lidarstreets.mesh import Mesh
 from lidarstreets.sites.site import Site
 from lidarstreets.streets.ground import Ground
+from lidarstreets.streets.regions import REGIONS
 from lidarstreets.streets.styles import Style, draw_style
 
 DRIVABLE = (Label.ROAD, Label.LANE_MARKING, Label.PARKING)
@@ -56,7 +57,8 @@ def draw_site(seed: int) -> tuple[Site, np.ndarray]:
     rng = np.random.default_rng(seed)
     drive = Drive()
     way = (drive.margin, drive.margin + 4 * drive.spacing)
-    ground = Ground(busy(draw_style(rng)), way[1] + drive.margin, rng, way)
+    region = list(REGIONS.values())[seed % len(REGIONS)]
+    ground = Ground(busy(draw_style(rng, region)), way[1] + drive.margin, rng, way)
     site, course = build_site(ground, 4, 8.0, rng, drive)
     return site, np.array([course.pose_at(index) for index in range(4)])
 

@@ -9,6 +9,7 @@ from lidarstreets.materials import Label
 from lidarstreets.streets.ground import RARELY_PARKED_SHARE, Ground
 from lidarstreets.streets.kinds import STREET_KINDS
 from lidarstreets.streets.plans import Island, Patch, SideRoad, rounded_union, strip_at
+from lidarstreets.streets.regions import REGIONS, Region
 from lidarstreets.streets.styles import Strip, draw_style
 
 LENGTH = 240.0
@@ -18,7 +19,7 @@ DRIVABLE = (Label.ROAD, Label.LANE_MARKING, Label.PARKING)
 
 def draw_ground(seed: int) -> Ground:
     rng = np.random.default_rng(seed)
-    return Ground(draw_style(rng), LENGTH, rng, COURSE)
+    return Ground(draw_style(rng, Region()), LENGTH, rng, COURSE)
 
 
 @pytest.fixture(scope="module", params=range(12))
@@ -133,9 +134,10 @@ def test_the_mesh_follows_the_height(ground: Ground) -> None:
     assert np.quantile(np.abs(error), 0.95) < 0.01
 
 
-def test_every_kind_of_street_is_drawn() -> None:
+@pytest.mark.parametrize("region", REGIONS)
+def test_every_kind_of_street_is_drawn(region: str) -> None:
     rng = np.random.default_rng(0)
-    styles = [draw_style(rng) for _ in range(300)]
+    styles = [draw_style(rng, REGIONS[region]) for _ in range(300)]
     assert {style.kind for style in styles} == set(STREET_KINDS)
     assert sum(kind.share for kind in STREET_KINDS.values()) == pytest.approx(1)
     for style in styles:
