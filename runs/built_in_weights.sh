@@ -23,7 +23,7 @@ case $sensor in
         ;;
     hdl32e)
         recipe=simulated-hdl32e-compact
-        calibration=(--prior 0 --bev 0.75)
+        calibration=(--prior 0 --bev 0.65)
         ;;
     *) echo "expected hdl64e or hdl32e, found $sensor" >&2 && exit 2 ;;
 esac

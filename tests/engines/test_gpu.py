@@ -593,7 +593,7 @@ def test_the_commands_of_the_page_run(
     capsys.readouterr()
     runpy.run_path(str(script), run_name="__main__")
     printed = capsys.readouterr().out
-    for title in ("points to labels", "stages", "predict from disk", "training of"):
+    for title in ("points to labels", "stages", "predict from disk", "training and validation of"):
         assert title in printed
     assert printed.count("|---") > 10
 
