@@ -19,6 +19,11 @@ def weighted_choice(rng: np.random.Generator, shares: Mapping[Option, float]) ->
     return list(shares)[rng.choice(len(weights), p=weights / weights.sum())]
 
 
+def scaled(shares: Mapping[Option, float], factors: Mapping[Option, float]) -> dict[Option, float]:
+    """Return shares times their factors, which are 1 where a factor is missing."""
+    return {name: share * factors.get(name, 1.0) for name, share in shares.items()}
+
+
 def patchy_normal(
     rng: np.random.Generator, places: NDArray[np.floating], patch: float, correlation: float
 ) -> NDArray[np.float64]:

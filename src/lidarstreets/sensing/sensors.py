@@ -52,10 +52,10 @@ class LidarModel:
     keeps_lost_returns: bool
     # Layout of the files, a key of `LAYOUTS`.
     layout: str
-    # Where the sensor drives, a key of `REGIONS`.
-    region: str
     # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
     shadow: tuple[tuple[float, float, float, float], ...]
+    # Where the sensor drives, a key of `REGIONS`.
+    region: str = "karlsruhe"
     # Share of the returns that are lost, whatever they hit, 0 to 1.
     drop: float = 0.01
     # Pairs of a rising elevation in degrees and a height in metres: lasers of this elevation look

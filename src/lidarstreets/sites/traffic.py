@@ -7,12 +7,11 @@ import numpy as np
 from lidarstreets.bodies import clutter, furniture
 from lidarstreets.bodies.vehicles import buses, cars, machines, people, trucks, two_wheelers
 from lidarstreets.bodies.vehicles.cars import open_door
-from lidarstreets.chance import weighted_choice
+from lidarstreets.chance import scaled, weighted_choice
 from lidarstreets.materials import Label
 from lidarstreets.mesh import Maker, Mesh, join, place
 from lidarstreets.sites.site import Site
 from lidarstreets.streets.plans import SideRoad
-from lidarstreets.streets.regions import scaled
 from lidarstreets.tables import read_table
 
 VEHICLE_SHARES = read_table(Path(__file__).with_suffix(".toml"))

@@ -3,11 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 from lidarstreets.tables import read_table
-
-Option = TypeVar("Option")
 
 
 @dataclass(frozen=True)
@@ -26,11 +23,6 @@ class Region:
     work_zones: float = 1.0
     # Factor on the heights of houses.
     storeys: float = 1.0
-
-
-def scaled(shares: Mapping[Option, float], factors: Mapping[Option, float]) -> dict[Option, float]:
-    """Return shares times their factors, which are 1 where a factor is missing."""
-    return {name: share * factors.get(name, 1.0) for name, share in shares.items()}
 
 
 _TABLE = read_table(Path(__file__).with_suffix(".toml"))

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarstreets.chance import weighted_choice
+from lidarstreets.chance import scaled, weighted_choice
 from lidarstreets.materials import Label
 from lidarstreets.streets.kinds import STREET_KINDS, Kind, Surroundings
-from lidarstreets.streets.regions import Region, scaled
+from lidarstreets.streets.regions import Region
 
 
 @dataclass(frozen=True)

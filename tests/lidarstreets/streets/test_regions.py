@@ -1,16 +1,15 @@
 """Test the regions, whose factors change the shares of streets and of what is in them."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from lidarstreets import drive_street
-from lidarstreets.materials import Label
+from lidarstreets.bodies.vehicles import trucks
 from lidarstreets.sensing.sensors import LIDAR_MODELS
-from lidarstreets.sites.traffic import VEHICLE_MAKERS
+from lidarstreets.sites.site import Site
+from lidarstreets.sites.traffic import VEHICLE_MAKERS, VEHICLE_SHARES, choose_vehicle
+from lidarstreets.streets.ground import Ground
 from lidarstreets.streets.kinds import STREET_KINDS
-from lidarstreets.streets.regions import REGIONS, Region, scaled
+from lidarstreets.streets.regions import REGIONS, Region
 from lidarstreets.streets.styles import draw_style
 
 
@@ -26,10 +25,6 @@ def test_factors_name_what_exists(region: str) -> None:
     assert set(REGIONS[region].vehicles) <= set(VEHICLE_MAKERS)
 
 
-def test_a_factor_scales_one_share() -> None:
-    assert scaled({"a": 0.25, "b": 0.5}, {"b": 3.0}) == {"a": 0.25, "b": 1.5}
-
-
 def test_a_region_changes_how_often_a_kind_of_street_is_drawn() -> None:
     def share_of(kind: str, region: Region) -> float:
         rng = np.random.default_rng(0)
@@ -41,15 +36,14 @@ def test_a_region_changes_how_often_a_kind_of_street_is_drawn() -> None:
     assert share_of("urban", Region(kinds={"urban": 2.0})) == pytest.approx(doubled, abs=0.03)
 
 
-def test_nuscenes_streets_have_more_trucks_than_streets_of_kitti() -> None:
-    def share_of_trucks(region: str) -> float:
-        counts = np.zeros(2)
-        model = LIDAR_MODELS["hdl32e"]
-        for street in range(12):
-            seed = np.random.SeedSequence((5, street))
-            (scan,) = drive_street(dataclasses.replace(model, region=region), 1, seed)
-            is_truck = np.isin(scan.labels & 0xFFFF, [Label.TRUCK, 258])
-            counts += is_truck.sum(), len(is_truck)
-        return float(counts[0] / counts[1])
+def test_a_region_changes_how_often_a_kind_of_vehicle_is_drawn() -> None:
+    def share_of_trucks(region: Region) -> float:
+        rng = np.random.default_rng(0)
+        site = Site(Ground(draw_style(rng, region), 120.0, rng, (40.0, 80.0)), rng)
+        makers = [choose_vehicle(site, "parked") for _ in range(2000)]
+        return makers.count(trucks.truck) / len(makers)
 
-    assert share_of_trucks("boston-singapore") > 1.5 * share_of_trucks("karlsruhe")
+    truck = VEHICLE_SHARES["parked"]["truck"] / sum(VEHICLE_SHARES["parked"].values())
+    tripled = 3 * truck / (1 + 2 * truck)
+    assert share_of_trucks(Region()) == pytest.approx(truck, abs=0.02)
+    assert share_of_trucks(Region(vehicles={"truck": 3.0})) == pytest.approx(tripled, abs=0.02)
