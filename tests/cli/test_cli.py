@@ -332,6 +332,18 @@ def test_weights_without_head_predict_by_the_other_methods(
 # ---- evaluate
 
 
+def test_evaluate_says_that_weights_without_head_have_no_amvnet(
+    world: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = world / "headless.safetensors"
+    command = f"evaluate {world}/data --weights {weights}"
+    succeed(command)
+    said = f"{weights} has no point_head: methods with it are not scored"
+    assert said in capsys.readouterr().out.replace("\n", " ")
+    succeed(f"{command} --methods rv,bev")
+    assert "has no" not in capsys.readouterr().out
+
+
 @pytest.fixture(scope="module")
 def scored(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder that `evaluate --weights --json --pictures` wrote."""

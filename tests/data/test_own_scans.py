@@ -53,6 +53,11 @@ def site(tmp_path: Path) -> Path:
     return tmp_path / "site"
 
 
+def test_a_missing_yaml_file_is_not_called_a_folder(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    fails(lambda: open_dataset(str(path)), path, "expected a YAML file", "check the path")
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.int64])
 def test_labels_are_read_from_files_of_integers_of_any_size(
     site: Path, dtype: type[np.integer[Any]]

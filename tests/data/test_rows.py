@@ -147,6 +147,23 @@ def test_a_table_that_was_written_column_by_column_is_refused(
     fails(lambda: read_cloud(path), path, "found values that fit neither")
 
 
+def test_rows_in_millimetres_are_read_if_the_user_names_the_columns(
+    table: np.ndarray, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.bin"
+    rows = table[:, :4] * [1000, 1000, 1000, 1]
+    path.write_bytes(row_bytes(rows, "float32"))
+    fails(lambda: read_cloud(path), path, "--columns x,y,z,intensity if these are millimetres")
+    cloud = read_cloud(path, parse_layout("x,y,z,intensity", None))
+    np.testing.assert_allclose(cloud.xyz, rows[:, :3], rtol=1e-6)
+
+
+def test_rows_without_a_finite_number_are_named(table: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(row_bytes(np.full_like(table[:, :4], np.nan), "float32"))
+    fails(lambda: read_cloud(path), path, "found no finite number")
+
+
 def test_the_user_s_columns_count(table: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     for dtype in (None, "float64"):
@@ -276,6 +293,17 @@ def test_text_of_other_things_is_refused(tmp_path: Path) -> None:
         path.write_text(text)
         fails(lambda path=path: read_cloud(path), path)  # type: ignore[misc]
         assert find_table(text.encode()) is None
+
+
+@pytest.mark.parametrize("separator", [";", " ", "\t"])
+def test_decimal_commas_are_named(separator: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(f"1,5{separator}-2,0{separator}0,25\n" * 5)
+    for scan in (path, tmp_path):
+        fails(lambda scan=scan: read_cloud(scan), path, "found decimal commas")  # type: ignore[misc]
+
+    path.write_text(separator.join(["0,5"] * 12) + "\n")  # a pose
+    fails(lambda: read_cloud(tmp_path), tmp_path, "found none in it")
 
 
 def test_text_files_of_a_folder_are_scans_only_if_nothing_else_is(tmp_path: Path) -> None:

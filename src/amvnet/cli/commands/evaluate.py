@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amvnet.cli.console import progress, show
+from amvnet.cli.console import progress, report, show
 from amvnet.cli.options import LabelledChoice, join_processes, load_segmenter
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
-from amvnet.models.methods import PAPER_METHODS, Compute, MethodName, widest_method
+from amvnet.models.methods import METHODS, PAPER_METHODS, Compute, MethodName, widest_method
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import ScanRecord
@@ -78,6 +78,10 @@ def evaluate(
         dataset = normalised(opened, normaliser_for(loaded))
         records = choice.records(dataset)
         check_files(records)
+        needed = {part for name in methods for part in METHODS[name].parts}
+        missing = sorted(needed.difference(loaded.parts))
+        if missing and processes.first:
+            report(f"{weights} has no {' and no '.join(missing)}: methods with it are not scored")
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]
         device = processes.device(choose_device(compute.device, compute.engine))

@@ -26,7 +26,7 @@ from amvnet.data.formats.detect import (
 )
 from amvnet.data.formats.registry import list_archive, open_bag, read_file, read_from_archive
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.formats.text import find_table, read_head
+from amvnet.data.formats.text import find_comma_table, find_table, read_head
 from amvnet.errors import InputError, shown
 from amvnet.files import fault_of_name
 
@@ -294,7 +294,9 @@ def _is_text_scan(path: Path) -> bool:
     is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
     if not is_text or not path.is_file():
         return False
-    table = find_table(read_head(path))
+    head = read_head(path)
+    # Reading a file with decimal commas raises an error that says what to do.
+    table = find_table(head) or find_comma_table(head)
     return table is not None and (bool(table.names) or table.count != POSE_COLUMNS)
 
 

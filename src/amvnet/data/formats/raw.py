@@ -29,6 +29,7 @@ FEWEST_BYTES = 4800  # the least size of a file whose values can show that no la
 MAX_INTENSITY = 65535  # the largest intensity that any sensor writes
 NEAR = 500.0  # the limit of coordinates in usual scans, metres
 USUAL_SHARE = 0.999  # the least share of points within these limits; the others are outliers
+IN_METRES = np.array([1e-3, 1e-3, 1e-3, 1], dtype=np.float32)  # factors on a row in millimetres
 NO_INTENSITY = -1.0  # the intensity that some tools write for a lost return; no other is negative
 
 
@@ -57,7 +58,13 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         if len(data) % kitti and len(data) % nuscenes:
             found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
             advice = f"copy the file again if it is truncated, or {layout.advice}"
-        if len(data) % XYZ_BYTES == 0:
+        elif _are_lost(data):
+            found = "no finite number"
+            advice = "record the scan again"
+        elif len(data) % kitti == 0 and _are_millimetres(data):
+            names = layout.advise(*KITTI_ROWS.columns)
+            advice = f"say {names} if these are millimetres, or {layout.advice}"
+        elif len(data) % XYZ_BYTES == 0:
             advice = f"say {layout.advise(*'xyz')} if the rows have no more, or {advice}"
         raise InputError(
             f"{path}: expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found "
@@ -137,11 +144,24 @@ def _usual_layout(data: np.ndarray, is_named: bool) -> RowLayout | None:
         table = data[:SAMPLE_BYTES].view(np.float32).reshape(-1, NUSCENES_COLUMNS)
         if _is_nuscenes(table, is_named):
             return NUSCENES_ROWS
-    if len(data) % KITTI_ROWS.record.itemsize == 0:
-        table = data[:SAMPLE_BYTES].view(np.float32).reshape(-1, KITTI_COLUMNS)
-        if _is_kitti(table):
-            return KITTI_ROWS
-    return None
+    is_whole = len(data) % KITTI_ROWS.record.itemsize == 0
+    return KITTI_ROWS if is_whole and _is_kitti(_kitti_table(data)) else None
+
+
+def _kitti_table(data: np.ndarray) -> NDArray[np.float32]:
+    """Return the first bytes of a file as rows (N, 4)."""
+    return data[:SAMPLE_BYTES].view(np.float32).reshape(-1, KITTI_COLUMNS)
+
+
+@np.errstate(invalid="ignore", over="ignore")
+def _are_millimetres(data: np.ndarray) -> bool:
+    """Return whether the values of a file fit KITTI's layout if they are divided by 1000."""
+    return _is_kitti(_kitti_table(data) * IN_METRES)
+
+
+def _are_lost(data: np.ndarray) -> bool:
+    """Return whether a file holds no finite float32; its size is a multiple of 4 bytes."""
+    return not np.isfinite(data.view(np.float32)).any()
 
 
 def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:

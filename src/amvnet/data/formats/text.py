@@ -105,7 +105,12 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
 
 def _require_table(path: Path) -> TextTable:
-    table = find_table(read_head(path))
+    head = read_head(path)
+    table = find_table(head)
+    if find_comma_table(head) is not None:
+        raise InputError(
+            f"{path}: expected numbers with decimal points, found decimal commas; write 1.5 for 1,5"
+        )
     if table is None:
         raise InputError(f"{path}: expected lines of numbers x y z ..., found other text; {ADVICE}")
     return table
@@ -125,6 +130,11 @@ def find_table(head: bytes) -> TextTable | None:
         if table is not None:
             return table
     return None
+
+
+def find_comma_table(head: bytes) -> TextTable | None:
+    """Return the layout of a text whose numbers have decimal commas; None if it has no points."""
+    return find_table(head.replace(b",", b".")) if find_table(head) is None else None
 
 
 def _decode(head: bytes) -> str:
