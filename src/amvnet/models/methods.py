@@ -104,8 +104,13 @@ def widest_method(parts: Collection[str]) -> MethodName:
 
     If there is none, return "amvnet": `check_method` then names a missing part.
     """
-    names = [name for name in PAPER_METHODS if set(METHODS[name].parts) <= set(parts)]
+    names = _methods_of(parts)
     return names[-1] if names else "amvnet"
+
+
+def _methods_of(parts: Collection[str]) -> list[MethodName]:
+    """Return the methods of `PAPER_METHODS` whose parts are all present."""
+    return [name for name in PAPER_METHODS if set(METHODS[name].parts) <= set(parts)]
 
 
 def check_two_networks(method: MethodName) -> None:
@@ -137,9 +142,11 @@ def check_method(method: MethodName, parts: Collection[str]) -> MethodName:
     needed = METHODS[method].parts
     missing = [part for part in needed if part not in parts]
     if missing:
+        possible = " or ".join(_methods_of(parts))
+        advice = f", or choose the method {possible}" if possible else ""
         raise InputError(
             f"expected weights with {', '.join(needed)} for the method {method}, "
-            f"found no {missing[0]}; train that part, or choose a method without it"
+            f"found no {missing[0]}; train that part{advice}"
         )
 
     return method
