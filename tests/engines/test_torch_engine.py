@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 import amvnet
 from amvnet.data.datasets.open import open_dataset
+from amvnet.data.laser_order import with_lasers
 from amvnet.engines.base import build_model
 from amvnet.engines.torch import TorchEngine
 from amvnet.inference.segmentation import expand_to_scan
@@ -66,6 +67,7 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
     """
     model = weights.build()
     intensity = trained_intensity(weights.training, weights.sensor)
+    scan = with_lasers(scan, weights.model.range_view.lasers)
     batch = PointBatch.of([match_scan(scan, intensity)])
     f = model.score_range(model.range_view.project(batch))
 

@@ -62,11 +62,12 @@ def calibrate(
     for network, factor in (("range_net", 2 * (1 - bev)), ("polar_net", 2 * bev)):
         if network not in weights.parts:
             raise InputError(f"expected weights with both networks, found no {network}; train it")
-        kernel = tensors[f"{network}.scores.weight"]
+        # The kernels of the built-in weights are float16, which would round the product.
+        kernel = tensors[f"{network}.scores.weight"].float()
         bias = tensors[f"{network}.scores.bias"]
         # BEV has a score for each class and voxel.
         shifted = (bias.unflatten(0, (-1, len(shift))) + shift).flatten()
-        tensors[f"{network}.scores.weight"] = (factor * kernel).to(kernel.dtype)
+        tensors[f"{network}.scores.weight"] = factor * kernel
         tensors[f"{network}.scores.bias"] = (factor * shifted).to(bias.dtype)
     return replace(weights, tensors=tensors)
 

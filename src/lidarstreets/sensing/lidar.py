@@ -172,6 +172,10 @@ def rays_of(sensor: LidarModel) -> Rays:
     offset = ((np.arange(lasers) * 0.618) % 1.0)[:, None]
     fraction = (np.arange(sensor.azimuth_steps) + offset) / sensor.azimuth_steps  # of a rotation
     azimuth = 2 * np.pi * fraction
+    # The device reports the last whole unit that it passed.
+    if sensor.azimuth_unit:
+        unit = np.radians(sensor.azimuth_unit)
+        azimuth = unit * (np.floor(azimuth / unit) + offset)
 
     horizontal = np.cos(elevation)
     x = horizontal * np.cos(azimuth)

@@ -54,6 +54,8 @@ class LidarModel:
     layout: str
     # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
     shadow: tuple[tuple[float, float, float, float], ...]
+    # Unit of the azimuth that the device counts in, degrees; 0 if it is too small to matter.
+    azimuth_unit: float = 0.0
     # Where the sensor drives, a key of `REGIONS`.
     region: str = "karlsruhe"
     # Share of the returns that are lost, whatever they hit, 0 to 1.

@@ -72,6 +72,25 @@ def wall(x: float, y: tuple[float, float] = (-30, 30)) -> Mesh:
     return part([np.array([lower, upper])], Surface.PLASTER, Label.BUILDING)
 
 
+@pytest.mark.parametrize("name", LIDAR_MODELS)
+def test_shots_are_whole_units_of_the_azimuth_apart(name: str) -> None:
+    """The HDL-64E of KITTI counts its azimuth in 0.09 degrees: 1 in 7 steps is half as long."""
+    model = replace(LIDAR_MODELS[name], shadow=())
+    rays = lidar.rays_of(model)
+    azimuth = np.degrees(np.arctan2(rays.direction[:, 1], rays.direction[:, 0]))
+    for laser in range(len(model.elevations)):
+        steps = np.diff(np.sort(azimuth[rays.ring == laser]))
+        if not model.azimuth_unit:
+            np.testing.assert_allclose(steps, 360 / model.azimuth_steps, atol=1e-3)
+            continue
+
+        units = steps / model.azimuth_unit
+        np.testing.assert_allclose(units, np.round(units), atol=1e-3)
+        short = np.mean(np.round(units) == 1)
+        assert set(np.round(units)) == {1, 2}
+        assert short == pytest.approx(0.148, abs=0.003)  # measured: 0.14 to 0.15
+
+
 def slab(start: float, end: float, depth: float) -> Mesh:
     """Return foliage from one x to another, 30 m wide and 20 m high, its skin facing outwards."""
     middle = ((start + end) / 2, 0, 0)
