@@ -21,9 +21,9 @@ export async function fetchedJson(path, advice) {
   }
 }
 
-/** Return the contents of a file that the build has compressed. Some hosts let the browser unpack such files already. */
-export async function unpacked(path) {
-  const file = await (await fetched(path)).blob(), [first] = new Uint8Array(await file.slice(0, 1).arrayBuffer());
+/** Return the contents of a file that the build may have compressed. Some hosts let the browser unpack such files already. */
+export async function unpacked(path, advice) {
+  const file = await (await fetched(path, advice)).blob(), [first] = new Uint8Array(await file.slice(0, 1).arrayBuffer());
   const contents = first === GZIP ? file.stream().pipeThrough(new DecompressionStream("gzip")) : file.stream();
   return new Response(contents).arrayBuffer();
 }

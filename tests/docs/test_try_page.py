@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import json
 import os
@@ -252,10 +253,13 @@ WEIGHTS = {
 
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_a_scan_gets_the_labels_of_the_onnx_runner(
-    name: str, session: Session, folder: Path
+    name: str, session: Session, folder: Path, tmp_path: Path
 ) -> None:
     weights = WEIGHTS[name]
-    expected = reference(session.files[name], weights, folder / "try" / weights)
+    graphs = shutil.copytree(folder / "try" / weights, tmp_path / weights)
+    for graph in graphs.glob("*.onnx"):
+        graph.write_bytes(gzip.decompress(graph.read_bytes()))  # the page unpacks them itself
+    expected = reference(session.files[name], weights, graphs)
     check_labels(session.results[name], expected)
     assert len(np.unique(expected)) > 3
 

@@ -1,7 +1,7 @@
 // Run the networks, which are graphs of `amvnet export`, in ONNX Runtime Web.
 
 import { InputError } from "../errors.js";
-import { fetched, fetchedJson } from "../files.js";
+import { fetchedJson, unpacked } from "../files.js";
 import { atPixels } from "./range_view.js";
 import { addToMaxima, atPillars, FEATURES, toMap } from "./polar_view.js";
 
@@ -36,7 +36,7 @@ export class Networks {
     const networks = new Networks();
     Object.assign(networks, { ort, folder, description, sessions: {}, k: description.classes.length - 1 });
     for (const name of GRAPHS[description.method]) {
-      const graph = await (await fetched(`${folder}/${description.graphs[name]?.file}`, ADVICE)).arrayBuffer();
+      const graph = await unpacked(`${folder}/${description.graphs[name]?.file}`, ADVICE);
       networks.sessions[name] = await ort.InferenceSession.create(new Uint8Array(graph), { executionProviders: PROVIDERS[device] });
     }
     return networks;

@@ -29,7 +29,7 @@ export function readRaw(bytes, name) {
   if (nuscenes && isNuscenes(nuscenes, isNamed)) columns = nuscenes;
   else if (kitti && isKitti(kitti)) columns = kitti;
   else if (bytes.length < FEWEST_BYTES) columns = isNamed ? nuscenes : kitti;
-  const isLost = !(kitti ?? nuscenes)?.some((values) => values.some(Number.isFinite));
+  const isLost = (kitti ?? nuscenes)?.every((values) => !values.some(Number.isFinite));
   if (!columns) throw new InputError(`${name}: ${whyNeither(bytes.length, isNamed, isLost)}`);
 
   checkPointCount(columns[0].length, name);
@@ -43,9 +43,8 @@ function whyNeither(size, isNamed, isLost) {
     return `${expected}, found ${size} bytes, which is no multiple of ${4 * width}; ${ADVICE}, or copy the file again`;
   }
   const expected = "expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found";
-  if (size % (4 * KITTI) === 0 || size % (4 * NUSCENES) === 0) {
-    return isLost ? `${expected} no finite number; record the scan again` : `${expected} values that fit neither; ${ADVICE}`;
-  }
+  if (isLost) return `${expected} no finite number; record the scan again`;
+  if (size % (4 * KITTI) === 0 || size % (4 * NUSCENES) === 0) return `${expected} values that fit neither; ${ADVICE}`;
   const sizes = `${size} bytes, which is a multiple of neither ${4 * KITTI} nor ${4 * NUSCENES}`;
   return `${expected} ${sizes}; copy the file again if it is truncated, or ${ADVICE}`;
 }
