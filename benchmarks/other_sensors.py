@@ -35,7 +35,12 @@ VLP32C = (
 def sensor(elevations: tuple[float, ...], height: float, steps: int) -> LidarModel:
     """Return an HDL-64E with other lasers, at another height, without a car below it."""
     return replace(
-        LIDAR_MODELS["hdl64e"], elevations=elevations, height=height, azimuth_steps=steps, shadow=()
+        LIDAR_MODELS["hdl64e"],
+        elevations=elevations,
+        height=height,
+        azimuth_steps=steps,
+        azimuth_unit=0.0,
+        shadow=(),
     )
 
 

@@ -71,22 +71,26 @@ def build(out: Path) -> None:
     for name in RUNTIME_SCRIPTS:
         copy(RUNTIME / name, (out / "ort" / name).with_suffix(".js"))
     for name in RUNTIME_BINARIES:
-        packed = gzip.compress((RUNTIME / name).read_bytes(), mtime=0)
-        (out / "ort" / f"{name}.gz").write_bytes(packed)
+        pack(RUNTIME / name, out / "ort" / f"{name}.gz")
 
     (out / "viewer.html").write_text(viewer(), encoding="utf-8")
     (out / "models.json").write_text(json.dumps(MODELS, indent=1) + "\n", encoding="utf-8")
     for model in MODELS:
         for path in graphs(model["folder"]).iterdir():
-            copy(path, out / model["folder"] / path.name)
-        for graph in (out / model["folder"]).glob("*.onnx"):
-            graph.write_bytes(gzip.compress(graph.read_bytes(), mtime=0))  # the page unpacks it
+            write = pack if path.suffix == ".onnx" else copy
+            write(path, out / model["folder"] / path.name)
     copy(sample(), out / MODELS[0]["sample"])
 
 
 def copy(path: Path, to: Path) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, to)
+
+
+def pack(path: Path, to: Path) -> None:
+    """Write a file compressed by gzip, as the page's `unpacked` reads it."""
+    to.parent.mkdir(parents=True, exist_ok=True)
+    to.write_bytes(gzip.compress(path.read_bytes(), mtime=0))
 
 
 def viewer() -> str:

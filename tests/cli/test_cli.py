@@ -338,10 +338,13 @@ def test_evaluate_says_that_weights_without_head_have_no_amvnet(
     weights = world / "headless.safetensors"
     command = f"evaluate {world}/data --weights {weights}"
     succeed(command)
-    said = f"{weights} has no point_head: methods with it are not scored"
+    said = f"not scored: amvnet, because {weights} has only"
     assert said in capsys.readouterr().out.replace("\n", " ")
     succeed(f"{command} --methods rv,bev")
-    assert "has no" not in capsys.readouterr().out
+    assert "not scored" not in capsys.readouterr().out
+    code, line = run_cli(*command.split(), "--methods", "amvnet")
+    assert code == 2
+    assert "no point_head" in line
 
 
 @pytest.fixture(scope="module")

@@ -29,21 +29,20 @@ export function readRaw(bytes, name) {
   if (nuscenes && isNuscenes(nuscenes, isNamed)) columns = nuscenes;
   else if (kitti && isKitti(kitti)) columns = kitti;
   else if (bytes.length < FEWEST_BYTES) columns = isNamed ? nuscenes : kitti;
-  const isLost = (kitti ?? nuscenes)?.every((values) => !values.some(Number.isFinite));
-  if (!columns) throw new InputError(`${name}: ${whyNeither(bytes.length, isNamed, isLost)}`);
+  if (!columns) throw new InputError(`${name}: ${whyNeither(bytes.length, isNamed, kitti ?? nuscenes)}`);
 
   checkPointCount(columns[0].length, name);
   return makeCloud(Object.fromEntries(columns.map((values, place) => [COLUMNS[place], { values, isInteger: false }])), name);
 }
 
-function whyNeither(size, isNamed, isLost) {
+function whyNeither(size, isNamed, found) {
   if (size < FEWEST_BYTES) {
     const width = isNamed ? NUSCENES : KITTI, names = COLUMNS.slice(0, width).join(" ");
     const expected = `expected rows of ${width} float32, columns ${names}`;
     return `${expected}, found ${size} bytes, which is no multiple of ${4 * width}; ${ADVICE}, or copy the file again`;
   }
   const expected = "expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found";
-  if (isLost) return `${expected} no finite number; record the scan again`;
+  if (found?.every((values) => !values.some(Number.isFinite))) return `${expected} no finite number; record the scan again`;
   if (size % (4 * KITTI) === 0 || size % (4 * NUSCENES) === 0) return `${expected} values that fit neither; ${ADVICE}`;
   const sizes = `${size} bytes, which is a multiple of neither ${4 * KITTI} nor ${4 * NUSCENES}`;
   return `${expected} ${sizes}; copy the file again if it is truncated, or ${ADVICE}`;

@@ -5,7 +5,7 @@ This module does not import torch, so that the command line can list the methods
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -104,13 +104,15 @@ def widest_method(parts: Collection[str]) -> MethodName:
 
     If there is none, return "amvnet": `check_method` then names a missing part.
     """
-    names = _methods_of(parts)
+    names = methods_of(parts)
     return names[-1] if names else "amvnet"
 
 
-def _methods_of(parts: Collection[str]) -> list[MethodName]:
-    """Return the methods of `PAPER_METHODS` whose parts are all present."""
-    return [name for name in PAPER_METHODS if set(METHODS[name].parts) <= set(parts)]
+def methods_of(
+    parts: Collection[str], names: Sequence[MethodName] = PAPER_METHODS
+) -> list[MethodName]:
+    """Return the methods among `names` whose parts are all present."""
+    return [name for name in names if set(METHODS[name].parts) <= set(parts)]
 
 
 def check_two_networks(method: MethodName) -> None:
@@ -142,7 +144,7 @@ def check_method(method: MethodName, parts: Collection[str]) -> MethodName:
     needed = METHODS[method].parts
     missing = [part for part in needed if part not in parts]
     if missing:
-        possible = " or ".join(_methods_of(parts))
+        possible = " or ".join(methods_of(parts))
         advice = f", or choose the method {possible}" if possible else ""
         raise InputError(
             f"expected weights with {', '.join(needed)} for the method {method}, "

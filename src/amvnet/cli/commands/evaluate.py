@@ -12,7 +12,14 @@ from amvnet.cli.console import progress, report, show
 from amvnet.cli.options import LabelledChoice, join_processes, load_segmenter
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
-from amvnet.models.methods import METHODS, PAPER_METHODS, Compute, MethodName, widest_method
+from amvnet.models.methods import (
+    PAPER_METHODS,
+    Compute,
+    MethodName,
+    check_method,
+    methods_of,
+    widest_method,
+)
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import ScanRecord
@@ -78,10 +85,7 @@ def evaluate(
         dataset = normalised(opened, normaliser_for(loaded))
         records = choice.records(dataset)
         check_files(records)
-        needed = {part for name in methods for part in METHODS[name].parts}
-        missing = sorted(needed.difference(loaded.parts))
-        if missing and processes.first:
-            report(f"{weights} has no {' and no '.join(missing)}: methods with it are not scored")
+        _check_methods(methods, weights, loaded.parts, processes.first)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]
         device = processes.device(choose_device(compute.device, compute.engine))
@@ -116,6 +120,22 @@ def evaluate(
         )
     if processes.first:
         show_evaluation(evaluation, data, json, tau)
+
+
+def _check_methods(
+    methods: tuple[MethodName, ...], weights: str, parts: tuple[str, ...], is_first: bool
+) -> None:
+    """Let the first process say which methods the weights lack parts for.
+
+    Raises:
+        InputError: if they lack parts for all methods.
+    """
+    scored = methods_of(parts, methods)
+    if not scored:
+        check_method(methods[0], parts)
+    left_out = [name for name in methods if name not in scored]
+    if left_out and is_first:
+        report(f"not scored: {', '.join(left_out)}, because {weights} has only {', '.join(parts)}")
 
 
 def show_evaluation(

@@ -67,9 +67,7 @@ def _open(spec: str) -> Dataset:
     path, version = _split_version(rest if kind in READERS else spec)
     if not path.is_dir():
         if spec.lower().endswith(ENDINGS):
-            raise InputError(
-                f"{path}: expected a YAML file that describes scans, found none; check the path"
-            )
+            return open_own(spec)  # raises what it raises for files:SPEC
         raise InputError(
             f"{path}: expected the folder of a dataset, found none{_or_description(path)}"
         )

@@ -55,10 +55,11 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         nuscenes = NUSCENES_ROWS.record.itemsize
         found = "values that fit neither"
         advice = layout.advice
-        if len(data) % kitti and len(data) % nuscenes:
+        is_whole = len(data) % kitti == 0 or len(data) % nuscenes == 0
+        if not is_whole:
             found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
             advice = f"copy the file again if it is truncated, or {layout.advice}"
-        elif _are_lost(data):
+        if is_whole and _are_lost(data):
             found = "no finite number"
             advice = "record the scan again"
         elif len(data) % kitti == 0 and _are_millimetres(data):

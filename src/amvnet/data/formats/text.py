@@ -107,7 +107,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 def _require_table(path: Path) -> TextTable:
     head = read_head(path)
     table = find_table(head)
-    if find_comma_table(head) is not None:
+    if table is None and find_comma_table(head) is not None:
         raise InputError(
             f"{path}: expected numbers with decimal points, found decimal commas; write 1.5 for 1,5"
         )
@@ -133,8 +133,8 @@ def find_table(head: bytes) -> TextTable | None:
 
 
 def find_comma_table(head: bytes) -> TextTable | None:
-    """Return the layout of a text whose numbers have decimal commas; None if it has no points."""
-    return find_table(head.replace(b",", b".")) if find_table(head) is None else None
+    """Return the layout of a text, given its head, if its commas are decimal points; else None."""
+    return find_table(head.replace(b",", b"."))
 
 
 def _decode(head: bytes) -> str:
