@@ -122,13 +122,8 @@ def test_rows_of_nothing_but_coordinates_are_asked_for_by_name(
     table: np.ndarray, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.bin"
-    for left_out in (
-        4,
-        3,
-        2,
-        1,
-        0,
-    ):  # the size may be a multiple of the rows of KITTI or nuScenes, or not
+    # The size may be a multiple of KITTI's or nuScenes' rows, or not.
+    for left_out in reversed(range(5)):
         path.write_bytes(row_bytes(table[left_out:, :3], "float32"))
         fails(lambda: read_cloud(path), path, "say --columns x,y,z if the rows have no more")
     cloud = read_cloud(path, parse_layout("x,y,z", None))
