@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,9 +13,10 @@ import amvnet
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 from amvnet.training.losses import class_weights
-from amvnet.weights.calibrate import calibrate, read_counts
+from amvnet.weights.calibrate import calibrate, main, read_counts
 from amvnet.weights.file import load, save
 
+from fixtures.commands import fails
 from fixtures.tiny import fresh_weights, without
 
 WEIGHTS = "sim-hdl64e"
@@ -77,6 +79,29 @@ def test_the_shift_undoes_a_share_of_the_class_weights() -> None:
 def test_an_impossible_weight_is_an_input_error(bev: float) -> None:
     with pytest.raises(InputError, match="above 0 and below 1"):
         calibrate(fresh_weights(), np.ones(19), bev=bev)
+
+
+def test_no_file_that_is_read_or_of_another_kind_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(out: Path) -> None:
+        arguments = ["calibrate", weights, counts, out]
+        monkeypatch.setattr(sys, "argv", list(map(str, arguments)))
+        main()
+
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    counts = tmp_path / "class_counts.npz"
+    np.savez(counts, counts=np.ones(19))
+    other = tmp_path / "scan.bin"
+    other.write_bytes(bytes(100))
+    before = {path: path.read_bytes() for path in (weights, counts, other)}
+    for out in before:
+        fails(lambda out=out: run(out), out)  # type: ignore[misc]
+        assert out.read_bytes() == before[out]
+
+    for _ in range(2):  # a run that is continued writes the file again
+        run(tmp_path / "calibrated.safetensors")
+    assert load(tmp_path / "calibrated.safetensors").parts == fresh_weights().parts
 
 
 def test_other_classes_or_a_missing_network_are_an_input_error(tmp_path: Path) -> None:

@@ -18,8 +18,10 @@ import numpy as np
 import torch
 
 from amvnet.errors import InputError
+from amvnet.outputs import Signature, check_outputs
 from amvnet.weights.file import Weights, load, save
 
+WEIGHTS = Signature("a weights file", rb".{8}\{")
 LEAST_FREQUENCY = 1e-4  # the least frequency of a class, as in the training's class weights
 
 
@@ -96,6 +98,8 @@ def main() -> None:
     parser.add_argument("--bev", type=float, default=0.65)
     options = parser.parse_args()
 
+    # A training that is continued calibrates again, but never its own input.
+    check_outputs({options.out: WEIGHTS}, [options.weights, options.counts], overwrite=True)
     counts = read_counts(options.counts)
     save(calibrate(load(options.weights), counts, options.prior, options.bev), options.out)
 
