@@ -51,22 +51,7 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     is_named = path.name.lower().endswith(NUSCENES_ENDING)
     usual = _usual_layout(data, is_named)
     if usual is None and len(data) >= FEWEST_BYTES:
-        kitti = KITTI_ROWS.record.itemsize
-        nuscenes = NUSCENES_ROWS.record.itemsize
-        found = "values that fit neither"
-        advice = layout.advice
-        is_whole = len(data) % kitti == 0 or len(data) % nuscenes == 0
-        if not is_whole:
-            found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
-            advice = f"copy the file again if it is truncated, or {layout.advice}"
-        if is_whole and _are_lost(data):
-            found = "no finite number"
-            advice = "record the scan again"
-        elif len(data) % kitti == 0 and _are_millimetres(data):
-            names = layout.advise(*KITTI_ROWS.columns)
-            advice = f"say {names} if these are millimetres, or {layout.advice}"
-        elif len(data) % XYZ_BYTES == 0:
-            advice = f"say {layout.advise(*'xyz')} if the rows have no more, or {advice}"
+        found, advice = _explain(data, layout)
         raise InputError(
             f"{path}: expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found "
             f"{found}; {advice}"
@@ -75,6 +60,24 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     usual = replace(usual, in_yaml=layout.in_yaml)
 
     return replace(_to_cloud(data, path, usual), note="")
+
+
+def _explain(data: np.ndarray, layout: RowLayout) -> tuple[str, str]:
+    """Return what a file holds whose values fit neither layout, and what to do about it."""
+    kitti, nuscenes = KITTI_ROWS.record.itemsize, NUSCENES_ROWS.record.itemsize
+    found, advice = "values that fit neither", layout.advice
+    if len(data) % kitti and len(data) % nuscenes:
+        found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
+        advice = f"copy the file again if it is truncated, or {advice}"
+    elif _are_lost(data):
+        return "no finite number", "record the scan again"
+
+    if len(data) % kitti == 0 and _are_millimetres(data):
+        names = layout.advise(*KITTI_ROWS.columns)
+        return found, f"say {names} if these are millimetres, or {advice}"
+    if len(data) % XYZ_BYTES == 0:
+        return found, f"say {layout.advise(*'xyz')} if the rows have no more, or {advice}"
+    return found, advice
 
 
 def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
