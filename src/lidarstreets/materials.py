@@ -49,6 +49,8 @@ class Label(IntEnum):
     CONSTRUCTION_VEHICLE = 302, "vehicle.construction", 20
     TRAILER = 303, "vehicle.trailer", 20
     CAMPER = 304, "vehicle.truck", 20
+    SEMI_TRAILER = 305, "vehicle.trailer", 18
+    MOVING_SEMI_TRAILER = 306, "vehicle.trailer", 258
 
     category: str
     raw: int
@@ -62,7 +64,8 @@ class Label(IntEnum):
         return label
 
 
-# Raw SemanticKITTI ids of moving bodies by class. Other classes have no such id.
+# Ids of moving bodies by class; except for semi-trailers, they are raw SemanticKITTI ids. Other
+# classes have no such id.
 MOVING = {
     Label.CAR: 252,
     Label.BICYCLIST: 253,
@@ -70,6 +73,7 @@ MOVING = {
     Label.MOTORCYCLIST: 255,
     Label.BUS: 257,
     Label.TRUCK: 258,
+    Label.SEMI_TRAILER: Label.MOVING_SEMI_TRAILER,
     Label.OTHER_VEHICLE: 259,
 }
 

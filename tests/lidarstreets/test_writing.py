@@ -181,12 +181,14 @@ def test_simulated_nuscenes_is_read_as_the_real_one(nuscenes: Path) -> None:
         classes |= set(scan.labels.tolist())
         assert (np.bincount(scan.ring) == 1084).all()  # a point for each shot, as in nuScenes
 
-        is_lost = np.linalg.norm(scan.points[:, :3], axis=1) < 1
-        assert (scan.labels[is_lost] == 0).all()
+        # Lost returns, and the roof of the car: a tenth of its points have the class of cars.
+        is_near = np.linalg.norm(scan.points[:, :3], axis=1) < 1
+        assert set(scan.labels[is_near]) == {0, 4}
+        assert 0.7 < is_near.sum() / (4_180 + 3_000) < 1.4
 
         x, y, z = scan.points[:, :3].T
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
-        error = np.abs(elevation - (-30.66 + scan.ring * 4 / 3))[~is_lost]
+        error = np.abs(elevation - (-30.66 + scan.ring * 4 / 3))[~is_near]
         assert np.median(error) < 0.5  # the device of each drive is a little off
         assert error.max() < 2.5  # correcting the motion of the sensor moves points off their beams
 

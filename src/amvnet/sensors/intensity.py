@@ -32,8 +32,8 @@ CONSTANT_SHARE = 0.01
 # Networks need no intensity if they were trained with this share of their scans without it.
 BLIND_SHARE = 0.2
 
-# Quantiles of the intensities in simulated training scans. Weights without quantiles of their own
-# use these.
+# Quantiles to which training brings the intensities of simulated scans. Weights without quantiles
+# of their own use these.
 SIMULATED_QUANTILES = {
     "hdl64e": (0.0, 0.0, 0.07, 0.133, 0.232, 0.311, 0.396, 0.492, 0.565, 0.755, 0.986),
     "hdl32e": (0.0, 0.0, 0.005, 0.007, 0.011, 0.039, 0.066, 0.11, 0.17, 0.265, 0.792),

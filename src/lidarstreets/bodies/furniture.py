@@ -245,7 +245,7 @@ def barrier(length: float) -> Mesh:
     ]  # fmt: skip
     along_street = prism(profile, length)[..., [1, 0, 2]]  # the profile lies across the street
 
-    return part([along_street], Surface.PLASTER, Label.BARRIER)
+    return part([along_street], Surface.BRICK, Label.BARRIER)
 
 
 def traffic_cone(rng: np.random.Generator) -> Mesh:
@@ -253,4 +253,4 @@ def traffic_cone(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(0.5, 0.9)
     foot = box((0.36, 0.36, 0.04))
     cone = tube((0, 0, 0.04), (0, 0, height), 0.15, 0.03)
-    return part([foot, cone], Surface.SIGN_FACE, Label.TRAFFIC_CONE)
+    return part([foot, cone], Surface.PLASTIC, Label.TRAFFIC_CONE)

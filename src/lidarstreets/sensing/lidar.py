@@ -108,7 +108,7 @@ class GroundAppearance(Protocol):
 
 @dataclass(frozen=True)
 class Rays:
-    """The R shots of one rotation that the car does not block, in the sensor's frame.
+    """R shots of one rotation, in the sensor's frame.
 
     They are sorted by laser from the top down, then by azimuth from +x.
 
@@ -163,8 +163,13 @@ class Hits:
 
 
 @lru_cache(maxsize=4)
-def rays_of(sensor: LidarModel) -> Rays:
-    """Return the rays of one rotation; the arrays are shared and read-only."""
+def rays_of(sensor: LidarModel, blocked: bool = False) -> Rays:
+    """Return the rays of one rotation; the arrays are shared and read-only.
+
+    Args:
+        sensor: the device.
+        blocked: return the rays that the car blocks, instead of the others.
+    """
     lasers = len(sensor.elevations)
     elevation = np.radians(np.array(sensor.elevations))[:, None]
 
@@ -189,12 +194,12 @@ def rays_of(sensor: LidarModel) -> Rays:
     sign = 1 if sensor.counter_clockwise else -1
     time = sensor.rotation_period * ((fraction + 0.5) % 1 - 0.5) * sign
 
-    free = ~_is_hidden(sensor)
+    chosen = _is_hidden(sensor) == blocked
     rays = Rays(
-        direction=direction[free].astype(np.float32),
-        height=height[free].astype(np.float32),
-        ring=ring[free],
-        time=time.ravel()[free].astype(np.float32),
+        direction=direction[chosen].astype(np.float32),
+        height=height[chosen].astype(np.float32),
+        ring=ring[chosen],
+        time=time.ravel()[chosen].astype(np.float32),
     )
     for array in (rays.direction, rays.height, rays.ring, rays.time):
         array.flags.writeable = False

@@ -1,14 +1,15 @@
 """Decide which pulses of a LiDAR return, at which range, and how bright."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
 from lidarstreets.chance import patchy_normal
-from lidarstreets.materials import REFLECTIONS, Label
-from lidarstreets.sensing.lidar import Hits
+from lidarstreets.materials import REFLECTIONS, Label, Surface
+from lidarstreets.sensing.lidar import Hits, rays_of
 from lidarstreets.sensing.sensors import LidarModel
 
 # Power of the range with which the brightness falls; see `LidarModel.half_range`.
@@ -38,6 +39,14 @@ GHOST_MIN_DISTANCE = 0.5
 GHOST_MEAN_DISTANCE = 6.0
 OWN_CAR_LASERS = 8  # number of the lowest lasers, which see racks and other parts of the car
 OWN_CAR_REACH = 2.0  # range of the farthest part of the car, metres
+# Share of the points within the car that have its class: enough to learn it from, and too few to
+# change the class weights.
+OWN_LABELLED = 0.1
+ROOF_INTENSITY = 0.08  # median intensity of the roof
+ROOF_RELIEF = 0.02  # standard deviation of the depth of the roof, metres
+ROOF_STEEPNESS = 0.15  # smallest sine of the angle below the horizon of a shot that hits the roof
+# Columns of `REFLECTIONS` that `LidarModel.surfaces` multiplies.
+_FACTOR_COLUMNS = [0, 1, 2, 5]
 DARK_FACTOR = 0.35  # largest factor on the reflectivity of a dark return
 MAX_NEIGHBOUR_ANGLE = 0.5  # largest angle between neighbouring shots of one laser, degrees
 
@@ -82,7 +91,7 @@ def receive(
         (N, 4) float32 x, y, z in metres and intensity in [0, 0.99]; (N,) uint32 class ids with the
         instance ids in the upper 16 bits; (N,) uint8 indices of the lasers.
     """
-    base, _, shade, _, drop, relief, ghost = REFLECTIONS[hits.surface].T
+    base, _, shade, _, drop, relief, ghost = _reflections(sensor.surfaces)[hits.surface].T
     reflectivity = base * np.exp(shade * hits.tint)
 
     # The received power falls with the square of the range. A return below the noise is lost.
@@ -118,12 +127,14 @@ def receive(
     if not sensor.keeps_lost_returns:
         return points, labels, rings
 
+    roof_points, roof_labels, roof_rings = _roof_returns(sensor, rng)
+    rings = np.concatenate([rings, roof_rings])
     lost_points, lost_rings = _lost_returns(sensor, rings, rng)
-    lost_labels = np.zeros(len(lost_points), dtype=np.uint32)
+    lost_labels = _own_labels(len(lost_points), rng)
 
     return (
-        np.concatenate([points, lost_points]),
-        np.concatenate([labels, lost_labels]),
+        np.concatenate([points, roof_points, lost_points]),
+        np.concatenate([labels, roof_labels, lost_labels]),
         np.concatenate([rings, lost_rings]),
     )
 
@@ -136,7 +147,7 @@ def _intensity(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Return the (N,) intensities in [0, 0.99] that the device reports."""
-    _, spread, _, dark, *_ = REFLECTIONS[hits.surface].T
+    _, spread, _, dark, *_ = _reflections(sensor.surfaces)[hits.surface].T
 
     # The device compensates for range and angle of incidence until the power is too small.
     power = hits.cosine * (10 / np.maximum(hits.distance, 1)) ** 2
@@ -151,7 +162,7 @@ def _intensity(
     brightness *= 1 - lasers.near_loss[hits.ring] * is_near
 
     darkness = _patchy(hits, rng) / np.maximum(dark, 1e-6)
-    brightness *= np.where(darkness < 1, DARK_FACTOR * darkness, 1)
+    brightness *= np.where(darkness < 1, DARK_FACTOR * darkness, 1) ** (1 / sensor.gamma)
 
     # The device reports weak returns, but not how bright they were.
     if sensor.least_brightness:
@@ -162,6 +173,16 @@ def _intensity(
     intensity = np.round(sensor.gain * brightness**sensor.gamma, sensor.decimals)
     clipped: NDArray[np.float64] = np.clip(intensity, 0, 0.99)
     return clipped
+
+
+@lru_cache(maxsize=4)
+def _reflections(surfaces: tuple[tuple[str, float, float, float, float], ...]) -> np.ndarray:
+    """Return `REFLECTIONS` with the factors of `LidarModel.surfaces`; the array is shared."""
+    table = REFLECTIONS.copy()
+    for name, *factors in surfaces:
+        table[Surface[name], _FACTOR_COLUMNS] *= factors
+    table.flags.writeable = False
+    return table
 
 
 def _patchy(hits: Hits, rng: np.random.Generator) -> np.ndarray:
@@ -207,6 +228,26 @@ def _mixed_distance(hits: Hits, sensor: LidarModel, rng: np.random.Generator) ->
     at_edge = are_neighbours & (depth > MIN_MIXED_STEP) & (depth < MAX_MIXED_STEP)
     is_mixed = at_edge & (rng.random(len(step)) < sensor.mixed)
     return hits.distance + np.where(is_mixed, rng.random(len(step)) * step, 0)
+
+
+def _roof_returns(
+    sensor: LidarModel, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points, labels and lasers of the shots that the car blocks, as `receive` does."""
+    rays = rays_of(sensor, blocked=True)
+    down = np.flatnonzero(rays.direction[:, 2] < -ROOF_STEEPNESS) if sensor.roof else np.arange(0)
+    count = len(down)
+
+    depth = sensor.roof + ROOF_RELIEF * rng.standard_normal(count)
+    direction = rays.direction[down]
+    intensity = np.minimum(ROOF_INTENSITY * rng.lognormal(0, 1, count), 0.4)
+    points = np.column_stack([direction * (depth / -direction[:, 2])[:, None], intensity])
+    return points.astype(np.float32), _own_labels(count, rng), rays.ring[down]
+
+
+def _own_labels(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the (count,) uint32 labels of points within the car: cars, or no class."""
+    return np.where(rng.random(count) < OWN_LABELLED, np.uint32(Label.CAR), np.uint32(0))
 
 
 def _lost_returns(

@@ -73,6 +73,12 @@ class LidarModel:
     # Mean share of the brightness of near surfaces that the upper half of the lasers loses, because
     # these lasers are focused far away; 0 to 1.
     near_loss: float = 0.0
+    # Surfaces that differ from `REFLECTIONS` where this device drove: the name of each, and factors
+    # on its reflectivity, the spread of its intensities, its shade and its roughness.
+    surfaces: tuple[tuple[str, float, float, float, float], ...] = ()
+    # Depth of the car's roof below the sensor in metres, if the shots that the car blocks return
+    # from the roof; 0 if they do not return.
+    roof: float = 0.0
     # Mean number of returns of a scan that come from the racks and the roof of the car itself.
     own_returns: float = 0.0
     # Factor on the noise of the intensity, `Reflection.spread`.

@@ -46,10 +46,31 @@ def test_a_maker_returns_a_plausible_body_on_the_ground(maker: Maker) -> None:
         mesh = maker(rng)
         assert np.isfinite(mesh.triangles).all()
         assert len(mesh) < 2000
-        assert set(np.unique(mesh.label)) <= {label, Label.OTHER_OBJECT}
+        towed = {Label.SEMI_TRAILER} if label == Label.TRUCK else set()
+        assert set(np.unique(mesh.label)) <= {label, Label.OTHER_OBJECT} | towed
         assert abs(mesh.triangles[..., 2].min()) < 0.08
         for size, (low, high) in zip(size_of(mesh), limits, strict=True):
             assert low < size < high
+
+
+def test_a_semi_trailer_stands_behind_its_truck() -> None:
+    """nuScenes labels the part behind the tractor unit as a trailer; SemanticKITTI does not."""
+    rng = np.random.default_rng(1)
+    trailers = 0
+    for _ in range(60):
+        mesh = trucks.truck(rng)
+        is_trailer = mesh.label == Label.SEMI_TRAILER
+        if not is_trailer.any():
+            continue
+
+        trailers += 1
+        x = mesh.triangles[..., 0].mean(axis=1)
+        assert x[is_trailer].mean() < x[~is_trailer].mean() - 3
+        assert set(np.unique(mesh.label[~is_trailer])) == {Label.TRUCK}
+
+    assert 5 < trailers < 20
+    assert Label.SEMI_TRAILER.raw == Label.TRUCK
+    assert Label.SEMI_TRAILER.category == Label.TRAILER.category
 
 
 @pytest.mark.parametrize("maker", [cars.car, trucks.truck, people.person])

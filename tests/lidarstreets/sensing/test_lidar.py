@@ -422,6 +422,38 @@ def test_brightness_is_half_at_half_the_range_and_weak_returns_have_none() -> No
     assert (near[:, 3] == 0).mean() < 0.05
 
 
+def test_the_shots_that_the_car_blocks_return_from_its_roof() -> None:
+    """nuScenes has a point for every shot; one in eight hits the roof of the car itself."""
+    shadow = ((150.0, 210.0, -90.0, -12.0),)
+    sensor = replace(EXACT, keeps_lost_returns=True, roof=0.5, shadow=shadow)
+    points, labels, ring = scan_mesh(wall(20), sensor)
+    assert (np.bincount(ring) == sensor.azimuth_steps).all()
+
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    is_roof = (distance > 1) & (distance < 3)  # lost returns are nearer, and the wall is farther
+    blocked = lidar.rays_of(sensor, blocked=True)
+    assert np.array_equal(np.sort(ring[is_roof]), np.sort(blocked.ring))
+    x, y, z = points[is_roof, :3].T
+    np.testing.assert_allclose(z, -0.5, atol=0.1)
+    assert np.degrees(np.arctan2(-z, np.hypot(x, y))).min() > 12
+    assert np.abs(np.degrees(np.arctan2(y, -x))).max() < 34
+
+    # So few points have a class that the shares of the classes hardly change.
+    for within_car in (is_roof, distance < 1):
+        assert (labels[within_car] == Label.CAR).mean() == pytest.approx(0.1, abs=0.02)
+        assert set(labels[within_car]) == {0, Label.CAR}
+
+
+def test_a_factor_on_a_surface_changes_its_brightness_alone() -> None:
+    brick = replace(wall(10), surface=np.full(2, Surface.BRICK, np.uint8))
+    sensor = replace(EXACT, gamma=2.0, gain=0.5)
+    bright = replace(sensor, surfaces=(("PLASTER", 1.2, 1.0, 1.0, 1.0),))
+    for mesh, ratio in ((wall(10), 1.2**2), (brick, 1.0)):
+        plain, with_factor = scan_mesh(mesh, sensor)[0], scan_mesh(mesh, bright)[0]
+        np.testing.assert_array_equal(plain[:, :3], with_factor[:, :3])
+        np.testing.assert_allclose(with_factor[:, 3], plain[:, 3] * ratio, atol=1e-5)
+
+
 def test_the_car_itself_returns_a_few_dark_points_in_firing_order() -> None:
     sensor = replace(EXACT, own_returns=30.0)
     points, labels, ring = scan_mesh(wall(20), sensor)

@@ -171,7 +171,7 @@ def excavator(rng: np.random.Generator) -> Mesh:
 
     return join(
         part([tracks * scale], Surface.RUBBER, _MACHINE),
-        part([np.concatenate(painted) * scale], Surface.LIGHT_PAINT, _MACHINE),
+        part([np.concatenate(painted) * scale], Surface.COATING, _MACHINE),
         glass([turned(cabin, angle) * scale], _MACHINE, clear=False),
     )
 
@@ -213,7 +213,7 @@ def _wheel_loader(rng: np.random.Generator) -> Mesh:
     bucket = [(2.5, lift), (3.5, lift), (2.8, lift + 1.0), (2.45, lift + 0.9)]
     solids = [prism(body, 1.6), frame, *arms]
     mesh = join(
-        part(solids, Surface.LIGHT_PAINT, _MACHINE),
+        part(solids, Surface.COATING, _MACHINE),
         part([prism(bucket, 2.4)], Surface.METAL, _MACHINE),
         glass([cabin], _MACHINE, bool(rng.random() < 0.5)),
         wheels(_MACHINE, (-1.4, 1.4), 2.3, radius, 0.5),

@@ -1,7 +1,7 @@
 """Make meshes of trucks: a chassis, a cab, and what the truck carries."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, prism, tube
 
-SEMI_TRAILER_SHARE = 0.10  # share of the trucks that have a semi-trailer
+SEMI_TRAILER_SHARE = 0.2  # share of the trucks that have a semi-trailer
 
 
 def truck(rng: np.random.Generator) -> Mesh:
@@ -145,12 +145,17 @@ def _semi_trailer(rng: np.random.Generator) -> Mesh:
     unit = box((5.6, 0.9, 0.3), (half - 2.9, 0, 0.65))
     axles = [half - 1.4, half - 4.9, -half + 1.6, -half + 2.9, -half + 4.2]
 
+    trailer = join(
+        part([rails, legs], Surface.METAL, Label.SEMI_TRAILER),
+        wheels(Label.SEMI_TRAILER, axles[2:], width, 0.5, 0.35),
+        *maker(rng, load),
+    )
     return join(
         cab(rng, half, rng.uniform(1.9, 2.4), width * 0.98, rng.uniform(3.0, 3.8)),
-        part([rails, legs, unit], Surface.METAL, Label.TRUCK),
-        wheels(Label.TRUCK, axles, width, 0.5, 0.35),
+        part([unit], Surface.METAL, Label.TRUCK),
+        wheels(Label.TRUCK, axles[:2], width, 0.5, 0.35),
         plates_and_lamps(Label.TRUCK, half, width, 0.6, 0.8),
-        *maker(rng, load),
+        replace(trailer, label=np.full_like(trailer.label, Label.SEMI_TRAILER)),
     )
 
 
