@@ -1,6 +1,6 @@
 """Decide which pulses of a LiDAR return, at which range, and how bright."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
 from lidarstreets.chance import patchy_normal
-from lidarstreets.materials import REFLECTIONS, Label, Surface
+from lidarstreets.materials import REFLECTIONS, Label, Reflection, Surface
 from lidarstreets.sensing.lidar import Hits, rays_of
 from lidarstreets.sensing.sensors import LidarModel
 
@@ -45,10 +45,13 @@ OWN_LABELLED = 0.1
 ROOF_INTENSITY = 0.08  # median intensity of the roof
 ROOF_RELIEF = 0.02  # standard deviation of the depth of the roof, metres
 ROOF_STEEPNESS = 0.15  # smallest sine of the angle below the horizon of a shot that hits the roof
-# Columns of `REFLECTIONS` that `LidarModel.surfaces` multiplies.
-_FACTOR_COLUMNS = [0, 1, 2, 5]
-DARK_FACTOR = 0.35  # largest factor on the reflectivity of a dark return
+DARK_FACTOR = 0.35  # largest factor on the intensity of a dark return
 MAX_NEIGHBOUR_ANGLE = 0.5  # largest angle between neighbouring shots of one laser, degrees
+
+
+_COLUMNS = [field.name for field in fields(Reflection)]
+# Columns of `REFLECTIONS` that `LidarModel.surfaces` multiplies.
+_FACTOR_COLUMNS = [_COLUMNS.index(name) for name in ("reflectivity", "spread", "shade", "rough")]
 
 
 @dataclass(frozen=True)
@@ -235,7 +238,7 @@ def _roof_returns(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the points, labels and lasers of the shots that the car blocks, as `receive` does."""
     rays = rays_of(sensor, blocked=True)
-    down = np.flatnonzero(rays.direction[:, 2] < -ROOF_STEEPNESS) if sensor.roof else np.arange(0)
+    down = np.flatnonzero((rays.direction[:, 2] < -ROOF_STEEPNESS) & (sensor.roof > 0))
     count = len(down)
 
     depth = sensor.roof + ROOF_RELIEF * rng.standard_normal(count)

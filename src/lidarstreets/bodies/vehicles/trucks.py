@@ -1,14 +1,14 @@
 """Make meshes of trucks: a chassis, a cab, and what the truck carries."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from lidarstreets.bodies.vehicles.parts import draw_paint, glass, plates_and_lamps, wheels
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
-from lidarstreets.mesh import Mesh, join, part
+from lidarstreets.mesh import Mesh, join, part, with_labels
 from lidarstreets.solids import box, copies, prism, tube
 
 SEMI_TRAILER_SHARE = 0.2  # share of the trucks that have a semi-trailer
@@ -146,8 +146,8 @@ def _semi_trailer(rng: np.random.Generator) -> Mesh:
     axles = [half - 1.4, half - 4.9, -half + 1.6, -half + 2.9, -half + 4.2]
 
     trailer = join(
-        part([rails, legs], Surface.METAL, Label.SEMI_TRAILER),
-        wheels(Label.SEMI_TRAILER, axles[2:], width, 0.5, 0.35),
+        part([rails, legs], Surface.METAL, Label.TRUCK),
+        wheels(Label.TRUCK, axles[2:], width, 0.5, 0.35),
         *maker(rng, load),
     )
     return join(
@@ -155,7 +155,7 @@ def _semi_trailer(rng: np.random.Generator) -> Mesh:
         part([unit], Surface.METAL, Label.TRUCK),
         wheels(Label.TRUCK, axles[:2], width, 0.5, 0.35),
         plates_and_lamps(Label.TRUCK, half, width, 0.6, 0.8),
-        replace(trailer, label=np.full_like(trailer.label, Label.SEMI_TRAILER)),
+        with_labels(trailer, {Label.TRUCK: Label.SEMI_TRAILER}),
     )
 
 
