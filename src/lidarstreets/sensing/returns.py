@@ -164,6 +164,7 @@ def _intensity(
     brightness *= np.interp(hits.distance, *np.transpose(sensor.response))
     brightness *= 1 - lasers.near_loss[hits.ring] * is_near
 
+    # Like the noise, darkness is a factor on the intensity.
     darkness = _patchy(hits, rng) / np.maximum(dark, 1e-6)
     brightness *= np.where(darkness < 1, DARK_FACTOR * darkness, 1) ** (1 / sensor.gamma)
 
