@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 
 import pytest
 import torch
@@ -100,14 +101,39 @@ def test_a_batch_of_two_equals_each_alone_in_eval(case: Case) -> None:
     assert not torch.allclose(together[0], together[1])
 
 
-@pytest.mark.parametrize("steps", [8, -16])
-def test_range_net_without_gru_is_equivariant_to_a_shift_by_its_stride(steps: int) -> None:
-    net = CASES["range"].in_eval()
+@pytest.mark.parametrize("columns", [8, -16])
+@pytest.mark.parametrize("name", ["range", "range with steps"])
+def test_range_net_without_gru_is_equivariant_to_a_shift_by_its_stride(
+    name: str, columns: int
+) -> None:
+    net = CASES[name].in_eval()
     image = torch.randn(1, 6, 7, 40)
-    shifted = net(image).roll(steps, 3)
+    shifted = net(image).roll(columns, 3)
 
-    torch.testing.assert_close(net(image.roll(steps, 3)), shifted, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(net(image.roll(columns, 3)), shifted, rtol=1e-4, atol=1e-5)
     assert not torch.allclose(net(image), shifted)
+
+
+def test_surface_steps_equal_a_loop_over_pixels_and_neighbours() -> None:
+    height, width = 4, 5
+    image = torch.randn(2, 6, height, width) * 10
+    image[:, 5] = (torch.rand(2, height, width) < 0.7).float()
+    image *= image[:, 5:]  # a pixel without a point is 0
+
+    expected = torch.zeros(2, 8, height, width)
+    for scan, row, column in product(range(2), range(height), range(width)):
+        x, y, z, _, _, mask = image[scan, :, row, column].tolist()
+        for index, (down, right) in enumerate([(0, -1), (0, 1), (-1, 0), (1, 0)]):
+            if not 0 <= row + down < height:
+                continue
+            other = image[scan, :, row + down, (column + right) % width].tolist()
+            if mask and other[5]:
+                farther = math.hypot(other[0], other[1]) - math.hypot(x, y)
+                steps = [math.asinh(farther / 0.1), math.asinh((other[2] - z) / 0.1)]
+                expected[scan, 2 * index : 2 * index + 2, row, column] = torch.tensor(steps)
+
+    assert expected.any(dim=(0, 2, 3)).all()
+    torch.testing.assert_close(range_net.surface_steps(image), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_the_unet_of_polar_net_is_equivariant_to_a_shift_by_its_stride() -> None:

@@ -14,7 +14,7 @@ from amvnet.errors import InputError
 from amvnet.models.layers import ResidualBlock
 from amvnet.models.methods import MethodName
 from amvnet.weights.file import PARTS, Weights
-from amvnet.weights.parts import deepened, for_classes, replace_part
+from amvnet.weights.parts import for_classes, grown, replace_part
 
 from fixtures.tiny import fresh_weights, street, without
 
@@ -155,7 +155,7 @@ def test_a_deeper_network_begins_as_the_shallower_one() -> None:
     more = tuple(blocks + 1 for blocks in net.blocks)
     model = replace(weights.model, range_net=replace(net, blocks=more, stem_blocks=2))
 
-    deeper = deepened(weights, "range_net", model, seed=0)
+    deeper = grown(weights, "range_net", model, seed=0)
     assert deeper is not None
     assert deeper.model.range_net.blocks == more
     assert deeper.parts == weights.parts
@@ -182,10 +182,25 @@ def test_a_deeper_network_begins_as_the_shallower_one() -> None:
     assert zeros == 2 + len(more)
 
 
+def test_a_network_with_steps_begins_as_the_network_without() -> None:
+    weights = fresh_weights()
+    assert not weights.model.range_net.steps
+    net = replace(weights.model.range_net, steps=True)
+    with_steps = grown(weights, "range_net", replace(weights.model, range_net=net), seed=0)
+    assert with_steps is not None
+    assert with_steps.model.range_net.steps
+
+    points, _ = street(0)
+    before = amvnet.load(weights, method="rv")(points).scores
+    after = amvnet.load(with_steps, method="rv")(points).scores
+    np.testing.assert_allclose(after, before, atol=1e-5)
+    assert grown(with_steps, "range_net", weights.model, seed=0) is None  # steps are kept
+
+
 def test_other_differences_cannot_be_grown() -> None:
     weights = fresh_weights()
     net = weights.model.range_net
     wider = replace(weights.model, range_net=replace(net, decoder=net.decoder + 8))
     fewer = replace(weights.model, range_net=replace(net, gru=False))
-    assert deepened(weights, "range_net", wider, seed=0) is None
-    assert deepened(weights, "range_net", fewer, seed=0) is None
+    assert grown(weights, "range_net", wider, seed=0) is None
+    assert grown(weights, "range_net", fewer, seed=0) is None

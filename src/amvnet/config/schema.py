@@ -136,6 +136,8 @@ class RangeNetConfig(Checked):
     """Channels at full resolution."""
     stem_blocks: Annotated[int, Range(0, 16)] = 0
     """Residual blocks at full resolution."""
+    steps: bool = False
+    """Also show the network how far and how high each pixel's surface steps to its neighbours."""
     widths: tuple[Channels, ...] = (96, 128, 224, 384, 384, 384, 384)
     """Channels of each stage. The width strides of the stages are 2, 4, 8, ..."""
     blocks: tuple[Annotated[int, Range(1, 16)], ...] = (2, 4, 4, 4, 2, 2, 2)

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from amvnet.config.schema import RangeNetConfig
 from amvnet.models.cpu_convolution import convolve
-from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
+from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample, wrap_width
 from amvnet.models.upsampled_conv import apply_to_joined
 from amvnet.models.views.range_view import CHANNELS
 
 FIRST_DECODED_STAGE = 1  # index of the first stage that the decoder uses; its width stride is 4
 RECURRENT_STAGES = 2  # number of the last stages that a GRU follows
+
+NEIGHBOURS = ((0, -1), (0, 1), (-1, 0), (1, 0))  # rows and columns to the left, right, top, bottom
+STEPS = 2 * len(NEIGHBOURS)  # number of channels of `surface_steps`
+SMALL_STEP = 0.1  # metres; `surface_steps` is linear for smaller steps
 
 
 class RangeNet(nn.Module):
@@ -26,8 +31,10 @@ class RangeNet(nn.Module):
     def __init__(self, config: RangeNetConfig, classes: int) -> None:
         super().__init__()
         c = config
-        self.input_norm = nn.BatchNorm2d(CHANNELS)
-        self.stem = ConvBlock(CHANNELS, c.stem)
+        self.steps = c.steps
+        channels = CHANNELS + STEPS if c.steps else CHANNELS
+        self.input_norm = nn.BatchNorm2d(channels)
+        self.stem = ConvBlock(channels, c.stem)
         self.stem_blocks = nn.Sequential(*_blocks(c.stem, c.stem_blocks))
         self.stages = nn.ModuleList(_stages(c))
 
@@ -48,6 +55,8 @@ class RangeNet(nn.Module):
         # At 20 m, bfloat16 resolves a coordinate only to 0.1 m, which is too coarse to tell a hedge
         # from a wall.
         with torch.autocast(image.device.type, enabled=False):
+            if self.steps:
+                image = torch.cat([image, surface_steps(image)], dim=1)
             full = self.stem(self.input_norm(image))
 
         full = self.stem_blocks(full)  # (B, stem, H, W)
@@ -88,6 +97,34 @@ class RangeNet(nn.Module):
 
         assert decoded is not None
         return decoded
+
+
+def surface_steps(image: Tensor) -> Tensor:
+    """Return how much farther and higher the four neighbours of each pixel are.
+
+    A step of some centimetres tells a hedge from a wall, or a sidewalk from a road. In coordinates
+    of up to 100 m it is small, so that a network learns it slowly. Steps here have the unit 0.1 m,
+    and large steps are compressed: asinh(step / 0.1 m).
+
+    Args:
+        image: (B, 6, H, W), the channels of `RangeImage`.
+
+    Returns:
+        (B, 8, H, W): the step of the horizontal distance and the step of the height, to the left,
+        right, upper and lower neighbour. A step from or to a pixel without a point is 0.
+    """
+    x, y, z, _, _, mask = image.split(1, dim=1)
+    surface = torch.cat([(x * x + y * y).sqrt(), z, mask], dim=1)
+
+    # The left and right ends of the image meet. Above and below it, there are no points.
+    padded = F.pad(wrap_width(surface, 1, 1), (0, 0, 1, 1))
+    height, width = image.shape[-2:]
+    steps = []
+    for row, column in NEIGHBOURS:
+        other = padded[..., row + 1 : row + 1 + height, column + 1 : column + 1 + width]
+        step = torch.asinh((other[:, :2] - surface[:, :2]) / SMALL_STEP)
+        steps.append(step * (other[:, 2:] * mask))
+    return torch.cat(steps, dim=1)
 
 
 def _stages(c: RangeNetConfig) -> list[nn.Module]:

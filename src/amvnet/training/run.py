@@ -29,7 +29,7 @@ from amvnet.training.run_folder import (
     write_record,
 )
 from amvnet.weights.file import Weights, save
-from amvnet.weights.parts import deepened, fits, for_classes, replace_part, resized
+from amvnet.weights.parts import fits, for_classes, grown, replace_part, resized
 
 
 def train(
@@ -131,7 +131,7 @@ def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> 
         if name == "head" and name in trained and not fits(init, part, plan.recipe.model):
             plan.report("head: new, because the head of the initial weights has other sizes")
             continue
-        begin = _deepened(plan, init, part) if name in trained else init
+        begin = _grown(plan, init, part) if name in trained else init
         if init.taxonomy.classes == weights.taxonomy.classes:
             weights = replace_part(weights, part, begin)
         elif name in trained:
@@ -140,15 +140,15 @@ def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> 
     return _with_finished(plan, weights)
 
 
-def _deepened(plan: Plan, init: Weights, part: str) -> Weights:
-    """Return initial weights with as many residual blocks in a part as the recipe says."""
+def _grown(plan: Plan, init: Weights, part: str) -> Weights:
+    """Return initial weights in which a part has the residual blocks and steps of the recipe."""
     if part == "point_head" or fits(init, part, plan.recipe.model):
         return init
-    deeper = deepened(init, part, plan.recipe.model, plan.recipe.training.seed)
-    if deeper is None:
+    larger = grown(init, part, plan.recipe.model, plan.recipe.training.seed)
+    if larger is None:
         return init
-    plan.report(f"{part}: the initial weights, with new residual blocks that begin as skips")
-    return deeper
+    plan.report(f"{part}: the initial weights, with new layers that begin without effect")
+    return larger
 
 
 def _with_finished(plan: Plan, weights: Weights) -> Weights:

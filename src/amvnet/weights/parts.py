@@ -118,22 +118,23 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
     return dataclasses.replace(begun, training={}, metrics={}), new
 
 
-def deepened(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights | None:
-    """Return weights in which one part has the residual blocks of a deeper configuration.
+def grown(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights | None:
+    """Return weights in which one part has the residual blocks and steps of a larger configuration.
 
     The part keeps its parameters. A new block begins as a skip connection: the scale of its last
-    batch norm is 0 (Goyal et al., 2017). The deeper network therefore computes the same as the
-    shallower one, except for the leak of one more activation.
+    batch norm is 0 (Goyal et al., 2017). New channels of the input (`RangeNetConfig.steps`) begin
+    with a kernel of 0. The larger network therefore computes the same as the smaller one, except
+    for the leak of one more activation in each new block.
 
     Args:
         weights: trained weights that hold the part.
         part: "range_net" or "polar_net".
-        model: the configuration with the sizes of the deeper part.
+        model: the configuration with the sizes of the larger part.
         seed: the seed of the other parameters of the new blocks.
 
     Returns:
         The weights, without a record of the part's training and metrics; None if the parts differ
-        in more than the number of residual blocks.
+        in more than residual blocks and steps.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -148,9 +149,11 @@ def deepened(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weig
 
     known = weights.part(part)
     fresh = module.state_dict()
-    is_deeper = all(key in fresh and fresh[key].shape == known[key].shape for key in known)
+    if model.range_net.steps and part == "range_net":
+        known = _with_steps(known, fresh)
+    is_larger = all(key in fresh and fresh[key].shape == known[key].shape for key in known)
     is_new_block = all(key.startswith(tuple(blocks)) for key in fresh.keys() - known.keys())
-    if not is_deeper or not is_new_block:
+    if not is_larger or not is_new_block:
         return None
 
     tensors = {key: value for key, value in weights.tensors.items() if not key.startswith(part)}
@@ -162,6 +165,20 @@ def deepened(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weig
         training=_with_entry(weights.training, {}, part),
         metrics=_with_entry(weights.metrics, {}, part),
     )
+
+
+def _with_steps(known: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return parameters of a range view whose first layers take as many channels as fresh ones."""
+    widened = dict(known)
+    for key, fresh_value in fresh.items():
+        value = known.get(key)
+        if key.startswith("input_norm.") and value is not None and value.dim():
+            widened[key] = torch.cat([value, fresh_value[len(value) :]])
+
+    kernel = known["stem.0.weight"]  # (C', C, 3, 3)
+    channels = fresh["stem.0.weight"].shape[1] - kernel.shape[1]
+    widened["stem.0.weight"] = torch.cat([kernel, kernel.new_zeros(len(kernel), channels, 3, 3)], 1)
+    return widened
 
 
 def _with_entry(records: Mapping[str, Any], others: Mapping[str, Any], part: str) -> dict[str, Any]:
