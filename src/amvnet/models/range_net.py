@@ -100,7 +100,7 @@ class RangeNet(nn.Module):
 
 
 def surface_steps(image: Tensor) -> Tensor:
-    """Return how much farther and higher the four neighbours of each pixel are.
+    """Return how much farther and higher the four neighbours of each pixel are (not in the paper).
 
     A step of some centimetres tells a hedge from a wall, or a sidewalk from a road. In coordinates
     of up to 100 m it is small, so that a network learns it slowly. Steps here have the unit 0.1 m,
