@@ -15,8 +15,7 @@ from amvnet.models.views.range_view import CHANNELS
 FIRST_DECODED_STAGE = 1  # index of the first stage that the decoder uses; its width stride is 4
 RECURRENT_STAGES = 2  # number of the last stages that a GRU follows
 
-NEIGHBOURS = ((0, -1), (0, 1), (-1, 0), (1, 0))  # rows and columns to the left, right, top, bottom
-STEPS = 2 * len(NEIGHBOURS)  # number of channels of `surface_steps`
+STEPS = 8  # number of channels of `surface_steps`
 SMALL_STEP = 0.1  # metres; `surface_steps` is linear for smaller steps
 
 
@@ -117,14 +116,24 @@ def surface_steps(image: Tensor) -> Tensor:
     surface = torch.cat([(x * x + y * y).sqrt(), z, mask], dim=1)
 
     # The left and right ends of the image meet. Above and below it, there are no points.
-    padded = F.pad(wrap_width(surface, 1, 1), (0, 0, 1, 1))
-    height, width = image.shape[-2:]
-    steps = []
-    for row, column in NEIGHBOURS:
-        other = padded[..., row + 1 : row + 1 + height, column + 1 : column + 1 + width]
-        step = torch.asinh((other[:, :2] - surface[:, :2]) / SMALL_STEP)
-        steps.append(step * (other[:, 2:] * mask))
+    ring = wrap_width(surface, 1, 1)
+    across = _steps(ring[..., :-1], ring[..., 1:])  # (B, 2, H, W + 1)
+    column = F.pad(surface, (0, 0, 1, 1))
+    down = _steps(column[..., :-1, :], column[..., 1:, :])  # (B, 2, H + 1, W)
+
+    # The step to a neighbour is the neighbour's step back, with the other sign.
+    steps = [-across[..., :-1], across[..., 1:], -down[..., :-1, :], down[..., 1:, :]]
     return torch.cat(steps, dim=1)
+
+
+def _steps(start: Tensor, end: Tensor) -> Tensor:
+    """Return the steps from pixels to others, 0 where one of both has no point.
+
+    Args:
+        start, end: (B, 3, H, W): the horizontal distance, the height and the mask.
+    """
+    step = torch.asinh((end[:, :2] - start[:, :2]) / SMALL_STEP)
+    return step * (start[:, 2:] * end[:, 2:])
 
 
 def _stages(c: RangeNetConfig) -> list[nn.Module]:

@@ -170,10 +170,9 @@ def grown(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights
 def _with_steps(known: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return parameters of a range view whose first layers take as many channels as fresh ones."""
     widened = dict(known)
-    for key, fresh_value in fresh.items():
-        value = known.get(key)
-        if key.startswith("input_norm.") and value is not None and value.dim():
-            widened[key] = torch.cat([value, fresh_value[len(value) :]])
+    for name in ("weight", "bias", "running_mean", "running_var"):
+        norm = known[f"input_norm.{name}"]
+        widened[f"input_norm.{name}"] = torch.cat([norm, fresh[f"input_norm.{name}"][len(norm) :]])
 
     kernel = known["stem.0.weight"]  # (C', C, 3, 3)
     channels = fresh["stem.0.weight"].shape[1] - kernel.shape[1]
