@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -43,6 +44,19 @@ def on_cpu() -> Iterator[None]:
         for module in (precision, torch_engine, onnx_engine):
             patch.setattr(module, "choose_device", choose_cpu)
         yield
+
+
+@pytest.fixture(autouse=True)
+def signal_handlers_are_kept() -> Iterator[None]:
+    """Check that a test leaves the handlers of signals as they were.
+
+    Processes that later tests fork inherit them: a pool of processes, for example, waits forever
+    for a worker whose handler of SIGTERM only raises an exception.
+    """
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    yield
+    after = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    assert after == before
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -49,9 +50,11 @@ def output_of_torchrun(folder: Path, *arguments: object) -> str:
 def output_of_launch(folder: Path, *arguments: object) -> str:
     """Run the command line in two processes by the function that torchrun calls.
 
-    The processes have imported torch already, which saves ten seconds.
+    The processes have imported torch already, which saves ten seconds. torchrun would end with
+    them, but this process goes on, with its own handlers of signals.
     """
     fork_server()
+    handlers = {number: signal.getsignal(number) for number in signal.valid_signals()}
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,
@@ -62,7 +65,12 @@ def output_of_launch(folder: Path, *arguments: object) -> str:
         max_restarts=0,
         start_method="forkserver",
     )
-    elastic_launch(config, _become_rank)(list(map(str, arguments)), folder)
+    try:
+        elastic_launch(config, _become_rank)(list(map(str, arguments)), folder)
+    finally:
+        for number, handler in handlers.items():
+            if signal.getsignal(number) != handler:
+                signal.signal(number, handler)
     return "".join(printed_by(rank, folder).text for rank in range(2))
 
 
