@@ -285,7 +285,7 @@ class AugmentConfig(Checked):
 
 @dataclass(frozen=True)
 class NetworkTraining(Checked):
-    """Training of one network: AdamW and a one-cycle schedule (section 4.2 of the paper)."""
+    """Training of one network: an optimizer and a one-cycle schedule (section 4.2 of the paper)."""
 
     epochs: Epochs
     """Number of passes over the training scans."""
@@ -293,8 +293,11 @@ class NetworkTraining(Checked):
     """Number of scans in one optimizer step."""
     lr: LearningRate
     """Peak of the one-cycle learning rate (open)."""
+    optimizer: Literal["adamw", "muon"] = "adamw"
+    """adamw: the paper's optimizer. muon: the same for the first and the last layer, for biases and
+    for norms; all other kernels take steps of equal length in all directions (not in the paper)."""
     weight_decay: Factor = 0.01
-    """AdamW's weight decay (open)."""
+    """Decoupled weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the peak of the learning rate (open)."""
     hold: Annotated[float, Range(0, 0.9)] = 0.0

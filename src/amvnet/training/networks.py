@@ -28,6 +28,7 @@ from amvnet.training.losses import (
     majority_labels,
     network_loss,
 )
+from amvnet.training.muon import Muon
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import PART_OF
 from amvnet.training.stage import Loaders, Stage, fit
@@ -38,7 +39,7 @@ REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 
 
 class NetworkStage(Stage):
-    """The base class of the stages `rv` and `bev`, which learn from batches of scans by AdamW.
+    """The base class of the stages `rv` and `bev`, which learn from batches of scans.
 
     A subclass defines `logits`.
 
@@ -142,13 +143,14 @@ class NetworkStage(Stage):
         # On a GPU, a fused optimizer takes the whole step in one launch. With it, Lightning cannot
         # clip the scaled gradients of float16.
         is_fused = self.device.type == "cuda" and self.trainer.precision != "16-mixed"
-        optimizer = torch.optim.AdamW(
-            self.trained.parameters(),
-            lr=self.config.lr,
-            weight_decay=self.config.weight_decay,
-            fused=is_fused or None,
-        )
-        return self.one_cycle(optimizer)
+        options: dict[str, Any] = {
+            "lr": self.config.lr,
+            "weight_decay": self.config.weight_decay,
+            "fused": is_fused or None,
+        }
+        if self.config.optimizer == "muon":
+            return self.one_cycle(Muon(self.trained, **options))
+        return self.one_cycle(torch.optim.AdamW(self.trained.parameters(), **options))
 
 
 class RangeStage(NetworkStage):

@@ -126,8 +126,8 @@ class Stage(L.LightningModule):
         opposite.
 
         Args:
-            optimizer: the optimizer, SGD or AdamW.
-            momentum: the highest momentum of SGD, or the highest first beta of AdamW.
+            optimizer: the optimizer: SGD, AdamW or Muon.
+            momentum: the highest momentum of SGD, or the highest first beta of the others.
         """
         # The schedule needs two steps before its peak, but a very short training has fewer.
         least = math.ceil(2 / self.config.warmup)
