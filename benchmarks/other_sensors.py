@@ -9,7 +9,7 @@ has seen. WEIGHTS is a name or a file (sim-hdl64e).
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,8 +87,12 @@ def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", nargs="?", type=Path, default="other_sensors")
+    parser.add_argument("weights", nargs="?", default="sim-hdl64e")
+    arguments = parser.parse_args()
+
     LIDAR_MODELS.update(OTHERS)
-    root = Path(sys.argv[1] if len(sys.argv) > 1 else "other_sensors")
-    segmenter = amvnet.load(sys.argv[2] if len(sys.argv) > 2 else "sim-hdl64e")
+    segmenter = amvnet.load(arguments.weights)
     for name in OTHERS:
-        compare(name, root / name, segmenter)
+        compare(name, arguments.folder / name, segmenter)
