@@ -94,6 +94,8 @@ def test_the_page_has_all_exit_codes() -> None:
     assert {int(code) for code in codes} == {code for _, code, _ in ENDS.values()}
 
 
+# The commands below sleep for short times, because Python looks at a signal only after the sleep if
+# the signal comes just before the sleep begins.
 STUBBORN = """
 import sys, time
 from amvnet.cli import main
@@ -105,7 +107,7 @@ def run(command, arguments):
         print("ready", flush=True)
         while True:
             try:
-                time.sleep(60)
+                time.sleep(0.1)
             except KeyboardInterrupt:
                 pass
 
@@ -211,7 +213,7 @@ def wait():
     print("ready", flush=True)
     while True:
         try:
-            time.sleep(60)
+            time.sleep(0.1)
         except KeyboardInterrupt:
             pass
 
@@ -308,7 +310,7 @@ def run(command, arguments):
         (folder / "graph").write_text("half")
         print("ready", flush=True)
         while True:
-            time.sleep(60)
+            time.sleep(0.1)
 
 main.run = run
 sys.argv = ["amvnet", "export"]
