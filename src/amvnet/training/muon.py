@@ -26,6 +26,7 @@ class Muon(torch.optim.AdamW):
     A few directions dominate the gradient of a kernel, so that a network learns the others slowly.
     A step of Muon is as long in every direction: the singular values of the averaged gradient, as a
     matrix with a row for each output channel, are replaced by 1.
+    `torch.optim.Muon` takes only matrices, and needs torch 2.9.
 
     Args:
         net: the network, whose parameters are in the order of its layers.
