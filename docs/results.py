@@ -44,8 +44,10 @@ def finetuning() -> str:
         "|---|---|---|---|",
     ]
     for row in read()["finetuning"]:
-        figures = f"{row['before']:.1f} | **{row['after']:.1f}**"
-        lines.append(f"| {row['labelled']} | {row['tested']} | {figures} |")
+        cells = [row["labelled"], row["tested"]]
+        for miou, accuracy in (row["before"], row["after"]):
+            cells.append(f"{miou:.1f} ({accuracy:.1f})")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
