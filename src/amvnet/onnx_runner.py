@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,8 @@ GRAPHS_BY_METHOD = {
     "amvnet": ("range_net", *POLAR_GRAPHS, "point_head"),
 }
 CHANNELS = 6  # channels of the range image: x, y, z, intensity, range, mask
+WINDOW = 5  # height and width of the window around a hidden point's pixel, pixels
+OWN_WEIGHT = 1e-3  # weight of a hidden point's own pixel
 LARGEST_DESCRIPTION = 10_000_000  # largest size of amvnet.json, bytes
 HEAD_BATCH = 2048  # number of uncertain points that the point head classifies at a time
 TINY = np.float32(1e-12)  # smallest divisor
@@ -170,8 +173,9 @@ class OnnxSegmenter:
     def score_range_view(self, scan: Scan) -> np.ndarray:
         """Return (P, K) class probabilities of finite points by the range view."""
         image, pixel = range_image(self.range_view, scan)
-        scores = self._run("range_net", image)[0]  # (K, H, W)
-        return softmax(scores.reshape(len(scores), -1)[:, pixel].T)
+        logits = self._run("range_net", image)[0]  # (K, H, W)
+        scores = softmax(logits.reshape(len(logits), -1).T)  # (H * W, K)
+        return scores_of_points(self.range_view, image, pixel, distances(scan.points), scores)
 
     def score_polar_view(self, points: np.ndarray) -> np.ndarray:
         """Return (P, K) class probabilities of finite points (P, 4) by the bird's-eye view."""
@@ -256,6 +260,44 @@ def range_image(view: RangeViewConfig, scan: Scan) -> tuple[np.ndarray, np.ndarr
     image = np.zeros((view.height * view.width, CHANNELS), dtype=np.float32)
     image[pixel[order]] = np.column_stack([points, distance, np.ones_like(distance)])[order]
     return np.ascontiguousarray(image.T).reshape(1, CHANNELS, view.height, view.width), pixel
+
+
+def scores_of_points(
+    view: RangeViewConfig,
+    image: np.ndarray,
+    pixel: np.ndarray,
+    distance: np.ndarray,
+    scores: np.ndarray,
+) -> np.ndarray:
+    """Return the (P, K) scores of the points, as `RangeImage.to_points` does.
+
+    Args:
+        view: the range view.
+        image, pixel: what `range_image` returns.
+        distance: (P,) distances of the points from the sensor, metres.
+        scores: (H * W, K) probabilities of the pixels.
+    """
+    own: np.ndarray = scores[pixel]
+    if not view.hidden:
+        return own
+
+    shown, mask = image[0, 4:].reshape(2, -1)
+    is_hidden = (np.abs(shown[pixel] - distance) > view.hidden) & (mask[pixel] > 0)
+    index = np.flatnonzero(is_hidden)
+    row, column = np.divmod(pixel[index], view.width)
+
+    around = OWN_WEIGHT * own[index]
+    total = np.full((len(index), 1), OWN_WEIGHT, dtype=np.float32)
+    offsets = range(-(WINDOW // 2), WINDOW // 2 + 1)
+    for down, right in product(offsets, offsets):
+        is_inside = (row + down >= 0) & (row + down < view.height)
+        place = np.where(is_inside, row + down, 0) * view.width + (column + right) % view.width
+        difference = (shown[place] - distance[index]) / np.float32(view.hidden)
+        weight = (np.exp(-(difference**2)) * mask[place] * is_inside)[:, None]
+        around += weight * scores[place]
+        total += weight
+    own[index] = around / total
+    return own
 
 
 def image_rows(view: RangeViewConfig, scan: Scan) -> np.ndarray:

@@ -23,7 +23,13 @@ from amvnet.errors import InputError
 from amvnet.export.onnx import describe_expectation
 from amvnet.inference.reading import expectation_of
 from amvnet.models.neighbours import nearest_others
-from amvnet.onnx_runner import image_rows, polar_features, range_image
+from amvnet.onnx_runner import (
+    distances,
+    image_rows,
+    polar_features,
+    range_image,
+    scores_of_points,
+)
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.weights.file import load
@@ -37,6 +43,8 @@ DRIVER = Path(__file__).parents[1] / "fixtures" / "try_modules.mjs"
 FORMATS = ("kitti.bin", "ascii.pcd", "binary.pcd", "compressed.pcd", "ascii.ply", "little.ply")
 POLAR = PolarViewConfig(radial=40, angular=36, vertical=8)
 NEIGHBOURS = 15
+K = 3  # number of classes whose scores are made up
+FLOATS = (".points", ".image", ".features", ".scores")  # the arrays of float32; others are int32
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="Node.js is not installed")
 
@@ -52,8 +60,11 @@ class Case:
     @property
     def expected(self) -> Expectation:
         expected = expectation_of(load(self.weights))
-        rows = self.rows or expected.view.rows
-        return dataclasses.replace(expected, view=dataclasses.replace(expected.view, rows=rows))
+        view = expected.view
+        rows = self.rows or view.rows
+        # Coarse images have hidden points.
+        view = dataclasses.replace(view, rows=rows, width=view.width // 8, hidden=0.02)
+        return dataclasses.replace(expected, view=view)
 
 
 def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
@@ -86,7 +97,7 @@ def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
         if "text" not in result:
             continue
         for path in folder.glob(f"{index}.*"):
-            kind = np.float32 if path.suffix in (".points", ".image", ".features") else np.int32
+            kind = np.float32 if path.suffix in FLOATS else np.int32
             result[path.suffix[1:]] = np.fromfile(path, kind)
     return results
 
@@ -298,6 +309,23 @@ def test_the_views_equal_those_of_the_onnx_runner(
     assert np.allclose(page["features"], features.ravel(), atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["kitti_like", "nuscenes_like", "higher_with_lost_returns"])
+def test_the_scores_of_points_equal_those_of_the_onnx_runner(
+    name: str, scans: dict[str, tuple[Case, dict[str, Any]]]
+) -> None:
+    case, page = scans[name]
+    view = case.expected.view
+    points = page["points"].reshape(-1, 4)
+    image, pixel = range_image(view, Scan(points, row=page["rows"]))
+    count = view.height * view.width * K
+    scores = (np.arange(count) * 7919 % 1000 / 1000).astype(np.float32).reshape(-1, K)
+
+    expected = scores_of_points(view, image, pixel, distances(points), scores)
+
+    assert np.allclose(page["scores"], expected.ravel(), atol=1e-5)
+    assert not np.allclose(expected, scores[pixel])  # some points are hidden
+
+
 def test_neighbours_are_as_near_as_those_of_the_package(
     scans: dict[str, tuple[Case, dict[str, Any]]],
 ) -> None:
@@ -307,10 +335,10 @@ def test_neighbours_are_as_near_as_those_of_the_package(
     expected = nearest_others(xyz, own, NEIGHBOURS)
     actual = page["neighbours"].reshape(-1, NEIGHBOURS)
 
-    def distances(near: np.ndarray) -> np.ndarray:
+    def lengths(near: np.ndarray) -> np.ndarray:
         return np.linalg.norm(xyz[near].astype(np.float64) - xyz[own][:, None], axis=2)
 
-    assert np.allclose(distances(actual), distances(expected))
+    assert np.allclose(lengths(actual), lengths(expected))
     assert (actual != own[:, None]).all()
 
 

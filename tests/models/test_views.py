@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from amvnet import onnx_runner
 from amvnet.config.schema import PolarViewConfig, RangeViewConfig
 from amvnet.errors import InputError
+from amvnet.models.views import range_view
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeImage, RangeView
@@ -233,6 +235,77 @@ def test_every_point_gets_the_scores_of_its_pixel(random_scan: RandomScan) -> No
     columns = RangeView(SPHERICAL).columns(batch)
     for i in range(500):
         assert torch.equal(point_scores[i], scores[batch.scan[i], :, rows[i], columns[i]])
+
+
+def scores_by_loop(scan: Scan, config: RangeViewConfig, scores: np.ndarray) -> np.ndarray:
+    """Return the (P, K) scores of the points, given those of the pixels (K, H, W)."""
+    pixels, nearest, image = range_view_by_loop(scan, config)
+    expected: list[np.ndarray] = []
+    for (x, y, z), pixel in zip(scan.points[:, :3].tolist(), pixels, strict=True):
+        row, column = divmod(pixel, config.width)
+        distance = math.sqrt(x * x + y * y + z * z)
+        if nearest[pixel] < 0 or abs(image[4, row, column] - distance) <= config.hidden:
+            expected.append(scores[:, row, column])
+            continue
+
+        total = range_view.OWN_WEIGHT
+        summed = total * scores[:, row, column]
+        for v in range(max(row - 2, 0), min(row + 3, config.height)):
+            for u in (np.arange(column - 2, column + 3) % config.width).tolist():
+                if image[5, v, u]:
+                    weight = math.exp(-(((image[4, v, u] - distance) / config.hidden) ** 2))
+                    summed += weight * scores[:, v, u]
+                    total += weight
+        expected.append(summed / total)
+    return np.array(expected)
+
+
+@pytest.mark.parametrize("nearest", [0.0, 8.0], ids=["all points", "without the car's own body"])
+def test_hidden_points_get_the_scores_of_pixels_at_their_range(
+    random_scan: RandomScan, nearest: float
+) -> None:
+    config = replace(SPHERICAL, width=60, hidden=2.0, nearest=nearest)
+    scans = [random_scan(900, 1), random_scan(700, 2)]
+    view = RangeView(config).project(PointBatch.of(scans))
+    scores = torch.rand(2, 3, 16, 60, generator=torch.Generator().manual_seed(0))
+
+    given = view.to_points(scores)
+
+    expected = [scores_by_loop(scan, config, scores[i].numpy()) for i, scan in enumerate(scans)]
+    np.testing.assert_allclose(given.numpy(), np.concatenate(expected), rtol=1e-3, atol=1e-5)
+    own = replace(view, hidden=0.0).to_points(scores)
+    assert 0.2 < (given != own).any(dim=1).float().mean() < 0.8
+    start = 0
+    for i, scan in enumerate(scans):
+        part = slice(start, start + len(scan))
+        start += len(scan)
+        image, pixel = onnx_runner.range_image(config, scan)
+        by_pixel = scores[i].permute(1, 2, 0).flatten(0, 1).numpy()
+        distance = onnx_runner.distances(scan.points)
+        alone = onnx_runner.scores_of_points(config, image, pixel, distance, by_pixel)
+        np.testing.assert_allclose(alone, given[part].numpy(), rtol=1e-4, atol=1e-6)
+
+
+def test_a_wall_behind_a_pole_gets_the_scores_of_the_wall() -> None:
+    config = replace(SPHERICAL, hidden=0.5)
+    step = 2 * math.pi / config.width
+    wall = [(20 * math.cos(i * step), 20 * math.sin(i * step), 0.0) for i in (-1.5, -0.5, 0.5)]
+    x, y, z = wall[1]
+    view = project_to_image(scan_of(*wall, (x / 4, y / 4, z)), config)
+    shows_wall = (view.image[:, 4:5] > 10).float()
+
+    scores = view.to_points(torch.cat([shows_wall, 1 - shows_wall], dim=1))
+
+    assert shows_wall.sum() == 2
+    torch.testing.assert_close(scores[:3, 0], torch.ones(3), rtol=0, atol=1e-3)
+    assert scores[3].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("case", degenerate_scans())
+def test_without_hidden_points_all_have_the_scores_of_their_pixels(case: str) -> None:
+    view = project_to_image(degenerate_scans()[case], replace(SPHERICAL, hidden=1000))
+    scores = torch.rand(1, 3, 16, 250)
+    assert torch.equal(view.to_points(scores), replace(view, hidden=0.0).to_points(scores))
 
 
 @pytest.mark.parametrize("ring", [16, 1000])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from amvnet.config.schema import RangeViewConfig
 from amvnet.models import voting
+from amvnet.models.views import range_view
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
@@ -55,7 +56,7 @@ def vote(batch: PointBatch, f: Tensor, view: RangeViewConfig = VIEW) -> Tensor:
 
 def vote_by_loop(batch: PointBatch, f: Tensor, view: RangeViewConfig) -> list[int]:
     """Return what each point is labelled by plain loops, with scans as they are and in order."""
-    half = voting.WINDOW // 2
+    half = range_view.WINDOW // 2
     offsets = range(-half, half + 1)
     kernel = {
         (dy, dx): math.exp(-(dx * dx + dy * dy) / (2 * voting.SIGMA**2))
@@ -107,6 +108,8 @@ def test_a_vote_equals_a_loop_over_the_points(
 ) -> None:
     for name, number in numbers.items():
         monkeypatch.setattr(voting, name, number)
+    window = numbers.get("WINDOW", range_view.WINDOW)
+    monkeypatch.setattr(range_view, "WINDOW", window)
     batch = PointBatch.of([crowded(random_scan(500), 1), crowded(random_scan(300), 2)])
     f = torch.rand(len(batch.points), K, generator=torch.Generator().manual_seed(0))
 

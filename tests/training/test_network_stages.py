@@ -57,7 +57,8 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
     batch, labels = batch_of_two()
     stage = polar_stage()
     with torch.no_grad():
-        voxels, point_logits = stage.logits(batch, labels)
+        voxels = stage.compare(batch, labels)
+        point_logits = stage.score(batch)
 
     # The voxels of each scan by their logits and labels, in any order.
     grid = stage.view.project(batch)
@@ -85,8 +86,7 @@ def test_the_loss_over_voxels_learns() -> None:
     optimizer = torch.optim.Adam(stage.trained.parameters(), 0.02)
     losses = []
     for _ in range(16):
-        voxels, _ = stage.logits(batch, labels)
-        loss = stage.loss(voxels)
+        loss = stage.loss(stage.compare(batch, labels))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -108,7 +108,7 @@ def test_the_loss_of_a_stage_equals_its_formula_with_all_weights(
 
     batch, labels = batch_of_two()
     with torch.no_grad():
-        scored, _ = made.eval().logits(batch, labels)
+        scored = made.eval().compare(batch, labels)
         losses = []
         for scan in range(2):
             logits = scored.logits[(scored.scan == scan) & (scored.labels > 0)]

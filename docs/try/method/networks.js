@@ -2,7 +2,7 @@
 
 import { InputError } from "../errors.js";
 import { fetchedJson, unpacked } from "../files.js";
-import { atPixels } from "./range_view.js";
+import { byPixel, toPoints } from "./range_view.js";
 import { addToMaxima, atPillars, FEATURES, toMap } from "./polar_view.js";
 
 const FORMAT = 2, DESCRIPTION = "amvnet.json", ADVICE = "export the weights again with amvnet export";
@@ -43,10 +43,10 @@ export class Networks {
   }
 
   /** Return the probabilities (n K) of points by the range view. */
-  async scoreRangeView({ image, pixel }) {
-    const { height, width } = this.description.range_view;
-    const scores = await this.run("range_net", [[image, [1, image.length / (height * width), height, width]]]);
-    return softmax(atPixels(scores, pixel, this.k), this.k);
+  async scoreRangeView(projection) {
+    const { range_view: view } = this.description, { height, width } = view, { image } = projection;
+    const logits = await this.run("range_net", [[image, [1, image.length / (height * width), height, width]]]);
+    return toPoints(view, projection, softmax(byPixel(logits, this.k), this.k), this.k);
   }
 
   /** Return the probabilities (n K) of points by the bird's-eye view. */

@@ -59,6 +59,10 @@ class RangeViewConfig(Checked):
     nearest: Annotated[float, Range(0, 1000)] = 0.0
     """Range below which points belong to the car itself, metres: the network does not see them, but
     they get labels. 0: no points (open)."""
+    hidden: Annotated[float, Range(0, 1000)] = 0.0
+    """A point is hidden if its range differs by more than this from the range that its pixel shows,
+    metres. It gets the mean scores of the pixels around it that show its own range (not in the
+    paper). 0: each point gets the scores of its pixel."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from amvnet.models.views.points import PointBatch
-from amvnet.models.views.range_view import RangeImage
+from amvnet.models.views.range_view import WINDOW, RangeImage
 
-# These are the numbers of RangeNet++.
+# With `WINDOW`, these are the numbers of RangeNet++.
 NEIGHBOURS = 5  # number of points that vote on a point's label, including the point itself
-WINDOW = 5  # height and width of the window around the point's pixel, pixels; odd
 SIGMA = 1.0  # standard deviation of the Gaussian over the window, pixels
 CUTOFF = 1.0  # largest weighted difference of range with which a point votes, metres
 
@@ -22,10 +21,10 @@ CUTOFF = 1.0  # largest weighted difference of range with which a point votes, m
 def vote(f: Tensor, batch: PointBatch, image: RangeImage) -> Tensor:
     """Return the share of each class in the votes on each point: (P, K).
 
-    The candidates are the point itself and the nearest point of each other pixel in the window. At
-    the left and right borders, the window continues at the other end of the image. The
-    `NEIGHBOURS` candidates whose range differs least, weighted by `window_weights`, vote. If two
-    classes have equally many votes, the class with the nearest voter has the larger share.
+    The candidates are the point itself and the nearest point of each other pixel in the window
+    (`RangeImage.windows`). The `NEIGHBOURS` candidates whose range differs least, weighted by
+    `window_weights`, vote. If two classes have equally many votes, the class with the nearest voter
+    has the larger share.
 
     Args:
         f: (P, K) class probabilities of the points by the range view's network.
@@ -33,7 +32,7 @@ def vote(f: Tensor, batch: PointBatch, image: RangeImage) -> Tensor:
         image: the range images of the batch.
     """
     distance = batch.points[:, :3].norm(dim=1)
-    pixels, is_outside = _windows(image)
+    pixels, is_outside = image.windows(image.pixel)
     own = WINDOW**2 // 2  # the place of the point itself in its window
 
     # The differences of range between each point and the points of its window, (P, S * S).
@@ -61,21 +60,3 @@ def window_weights() -> Tensor:
     squares = offsets[:, None] ** 2 + offsets**2
     gaussian = torch.exp(-squares / (2 * SIGMA**2))
     return 1 - (gaussian / gaussian.sum()).flatten()
-
-
-def _windows(image: RangeImage) -> tuple[Tensor, Tensor]:
-    """Return the pixels around each point's pixel, row by row.
-
-    Returns:
-        (P, S * S) indices into the B * H * W pixels of the batch; and (P, S * S) bool: whether the
-        pixel would lie above or below the point's image, so that it does not count.
-    """
-    _, _, height, width = image.image.shape
-    offsets = torch.arange(WINDOW, device=image.pixel.device) - WINDOW // 2
-    rows = (image.pixel // width)[:, None] + offsets  # rows counted over all images, (P, S)
-    columns = ((image.pixel % width)[:, None] + offsets) % width
-    is_outside = rows // height != (image.pixel // (width * height))[:, None]
-
-    rows = rows.where(~is_outside, 0)
-    pixels = rows[:, :, None] * width + columns[:, None]
-    return pixels.flatten(1), is_outside.repeat_interleave(WINDOW, dim=1)

@@ -41,7 +41,7 @@ REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 class NetworkStage(Stage):
     """The base class of the stages `rv` and `bev`, which learn from batches of scans.
 
-    A subclass defines `logits`.
+    A subclass defines `compare` and `score`.
 
     Args:
         view: the projection.
@@ -71,13 +71,17 @@ class NetworkStage(Stage):
         self.batches = 0
         self.labelled: Tensor | int = 0
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
-        """Return the pixels or voxels that the loss compares, and the (P, K) logits of all points.
+    def compare(self, batch: PointBatch, labels: Tensor) -> Scored:
+        """Return the pixels or voxels that the loss compares with their labels.
 
         Args:
             batch: the P valid points of some scans.
             labels: (P,) train ids.
         """
+        raise NotImplementedError
+
+    def score(self, batch: PointBatch) -> Tensor:
+        """Return scores (P, K) of the P points of some scans, the largest for their class."""
         raise NotImplementedError
 
     def loss(self, scored: Scored) -> Tensor:
@@ -87,7 +91,7 @@ class NetworkStage(Stage):
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         points, labels = batch
-        scored, _ = self.logits(points, labels)
+        scored = self.compare(points, labels)
         loss = self.loss(scored)
         self.batches += 1
         self.labelled += (scored.labels > 0).any().int()  # a tensor, so that a GPU need not wait
@@ -114,8 +118,7 @@ class NetworkStage(Stage):
 
     def validation_step(self, batch: Batch, index: int) -> None:
         points, labels = batch
-        _, logits = self.logits(points, labels)
-        prediction = (logits.argmax(dim=1) + 1).cpu().numpy()
+        prediction = (self.score(points).argmax(dim=1) + 1).cpu().numpy()
         self.matrix += confusion(labels.cpu().numpy(), prediction, self.taxonomy.size)
 
     def step_factor(self, count: int, index: int) -> float:
@@ -160,20 +163,23 @@ class RangeStage(NetworkStage):
     view: RangeView
     default_region_loss = staticmethod(dice)
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
+    def compare(self, batch: PointBatch, labels: Tensor) -> Scored:
         view = self.view.project(batch)
         image = self.trained(view.image)  # (B, K, H, W)
         pixels = image.permute(0, 2, 3, 1).flatten(0, 2)  # (B * H * W, K)
 
         # Pixels without a point have no label.
         index = (view.nearest >= 0).nonzero()[:, 0]
-        scored = Scored(
+        return Scored(
             logits=pixels.index_select(0, index),
             labels=labels[view.nearest[index]],
             scan=index // (len(pixels) // batch.count),
             scans=batch.count,
         )
-        return scored, pixels[view.pixel]
+
+    def score(self, batch: PointBatch) -> Tensor:
+        view = self.view.project(batch)
+        return view.to_points(self.trained(view.image).softmax(dim=1))
 
 
 class PolarStage(NetworkStage):
@@ -183,10 +189,13 @@ class PolarStage(NetworkStage):
     view: PolarView
     default_region_loss = staticmethod(lovasz_softmax)
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
+    def compare(self, batch: PointBatch, labels: Tensor) -> Scored:
         view = self.view.project(batch)
-        scores = self.trained(view)  # (M, Z * K)
-        return _score_voxels(view, scores, labels), view.to_points(scores)
+        return _score_voxels(view, self.trained(view), labels)
+
+    def score(self, batch: PointBatch) -> Tensor:
+        view = self.view.project(batch)
+        return view.to_points(self.trained(view))
 
 
 def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:

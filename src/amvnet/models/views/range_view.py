@@ -14,6 +14,9 @@ from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 
 CHANNELS = 6  # number of channels of a range image: x, y, z, intensity, range, mask
+WINDOW = 5  # height and width of the window around a point's pixel, pixels; odd
+# The weight of a hidden point's own pixel, which decides if no pixel around it shows its range.
+OWN_WEIGHT = 1e-3
 # Number of lower bits in a key of `_nearest` that hold a point's index; the upper bits hold the
 # range of the point.
 _INDEX_BITS = 32
@@ -28,19 +31,73 @@ class RangeImage:
             has a point. All values of a pixel without a point are 0.
         pixel: (P,) int64: each point's pixel, an index into the B * H * W pixels of the batch.
         nearest: (B * H * W,) int32: the index of the point that each pixel shows; -1 for no point.
+        distance: (P,) the range of each point, metres.
+        hidden: the difference of range above which a point is hidden (`RangeViewConfig.hidden`).
     """
 
     image: Tensor
     pixel: Tensor
     nearest: Tensor
+    distance: Tensor
+    hidden: float = 0.0
 
     def to_points(self, scores: Tensor) -> Tensor:
-        """Return the scores (P, K) of each point's pixel.
+        """Return the scores (P, K) of the points: those of their pixels.
+
+        A hidden point lies behind the point that its pixel shows, such as a wall behind a pole, so
+        that these scores say nothing about it. It gets the mean scores of the pixels in a window
+        around it. A pixel that shows a point d metres nearer or farther than the hidden point has
+        the weight exp(-(d / hidden)^2).
 
         Args:
-            scores: (B, K, H, W) logits or probabilities.
+            scores: (B, K, H, W) probabilities.
         """
-        return scores.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, self.pixel)
+        scores_by_pixel = scores.permute(0, 2, 3, 1).flatten(0, 2)
+        own = scores_by_pixel.index_select(0, self.pixel)
+        if not self.hidden:
+            return own
+
+        shown = self.image[:, 4].flatten()
+        has_point = self.nearest >= 0
+        difference = (shown.index_select(0, self.pixel) - self.distance).abs()
+        is_hidden = has_point.index_select(0, self.pixel) & (difference > self.hidden)
+        index = is_hidden.nonzero()[:, 0]  # (N,)
+
+        pixels, is_outside = self.windows(self.pixel.index_select(0, index))  # (N, S * S)
+
+        # `index_select` is faster than an index.
+        flat = pixels.flatten()
+        distance = self.distance.index_select(0, index)[:, None]
+        difference = shown.index_select(0, flat).view(pixels.shape) - distance
+        counts = has_point.index_select(0, flat).view(pixels.shape) & ~is_outside
+        weights = torch.exp(-((difference / self.hidden) ** 2)).where(counts, 0)
+
+        near = scores_by_pixel.index_select(0, flat)
+        near = near.view(*pixels.shape, own.shape[1])  # (N, S * S, K)
+        around = torch.bmm(weights[:, None], near)[:, 0]
+        around = around.add_(own.index_select(0, index), alpha=OWN_WEIGHT)
+        total = weights.sum(dim=1, keepdim=True).add_(OWN_WEIGHT)
+        return own.index_copy_(0, index, around / total)
+
+    def windows(self, pixel: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pixels around some pixels (N,), row by row.
+
+        At the left and right borders, a window continues at the other end of the image.
+
+        Returns:
+            (N, S * S) indices into the B * H * W pixels of the batch, for windows of S x S pixels;
+            and (N, S * S) bool: whether a pixel would lie above or below the image, so that it does
+            not count.
+        """
+        _, _, height, width = self.image.shape
+        offsets = torch.arange(WINDOW, device=pixel.device) - WINDOW // 2
+        rows = (pixel // width)[:, None] + offsets  # rows counted over all images, (N, S)
+        columns = ((pixel % width)[:, None] + offsets) % width
+        is_outside = rows // height != (pixel // (width * height))[:, None]
+
+        rows = rows.where(~is_outside, 0)
+        pixels = rows[:, :, None] * width + columns[:, None]
+        return pixels.flatten(1), is_outside.repeat_interleave(WINDOW, dim=1)
 
 
 class RangeView:
@@ -73,7 +130,7 @@ class RangeView:
 
         image = values[nearest]  # -1 selects the last row
         image = image.view(batch.count, c.height, c.width, CHANNELS).permute(0, 3, 1, 2)
-        return RangeImage(image, pixel, nearest)
+        return RangeImage(image, pixel, nearest, distance, c.hidden)
 
     def columns(self, batch: PointBatch) -> Tensor:
         """Return the columns (P,) of the points by their azimuth.
