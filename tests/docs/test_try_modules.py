@@ -318,7 +318,7 @@ def test_the_scores_of_points_equal_those_of_the_onnx_runner(
     points = page["points"].reshape(-1, 4)
     image, pixel = range_image(view, Scan(points, row=page["rows"]))
     count = view.height * view.width * K
-    scores = (np.arange(count) * 7919 % 1000 / 1000).astype(np.float32).reshape(-1, K)
+    scores = (np.arange(count) * 7919 % 1000 / 1000).astype(np.float32).reshape(K, -1).T
 
     expected = scores_of_points(view, image, pixel, distances(points), scores)
 

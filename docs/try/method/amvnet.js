@@ -18,7 +18,7 @@ export async function segment(networks, { points, rows }, step) {
 
   if (method !== "bev") {
     const image = await step("project to the range image", () => rangeImage(description.range_view, points, rows));
-    scores.rv = await step("range-view network", () => networks.scoreRangeView(image));
+    scores.rv = await step("range-view network", () => networks.scoreRangeView(image, points));
   }
   if (method !== "rv") {
     const grid = await step("project to the polar grid", () => polarGrid(description.polar_view, points));

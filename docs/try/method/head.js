@@ -10,11 +10,9 @@ export async function classify(networks, { points, f, g, uncertain, neighbours }
   const { k, description } = networks, scale = Math.fround(description.point_head.position_scale);
   const width = 2 * k + 4, n = neighbours.length / uncertain.length, scores = new Float32Array(uncertain.length * k);
 
-  const fill = (target, start, i) => {
-    target.set(f.subarray(i * k, (i + 1) * k), start);
-    target.set(g.subarray(i * k, (i + 1) * k), start + k);
-    target.set(points.subarray(4 * i, 4 * i + 4), start + 2 * k);
-  };
+  const fill = (target, start, i) =>
+    [f.subarray(i * k, (i + 1) * k), g.subarray(i * k, (i + 1) * k), points.subarray(4 * i, 4 * i + 4)]
+      .forEach((values, part) => target.set(values, start + part * k));
   for (let first = 0; first < uncertain.length; first += PART) {
     const part = uncertain.subarray(first, first + PART);
     const point = new Float32Array(part.length * width), rows = new Float32Array(part.length * n * width);

@@ -2,8 +2,8 @@
 
 import { InputError } from "../errors.js";
 import { fetchedJson, unpacked } from "../files.js";
-import { byPixel, toPoints } from "./range_view.js";
-import { addToMaxima, atPillars, FEATURES, toMap } from "./polar_view.js";
+import { scoreHidden } from "./range_view.js";
+import { addToMaxima, atCells, FEATURES, toMap } from "./polar_view.js";
 
 const FORMAT = 2, DESCRIPTION = "amvnet.json", ADVICE = "export the weights again with amvnet export";
 const POLAR = ["polar_points", "polar_pillars", "polar_map", "polar_scores"];
@@ -43,10 +43,11 @@ export class Networks {
   }
 
   /** Return the probabilities (n K) of points by the range view. */
-  async scoreRangeView(projection) {
-    const { range_view: view } = this.description, { height, width } = view, { image } = projection;
-    const logits = await this.run("range_net", [[image, [1, image.length / (height * width), height, width]]]);
-    return toPoints(view, projection, softmax(byPixel(logits, this.k), this.k), this.k);
+  async scoreRangeView(projection, points) {
+    const { range_view: view } = this.description, size = view.height * view.width, { image, pixel } = projection;
+    const logits = await this.run("range_net", [[image, [1, image.length / size, view.height, view.width]]]);
+    const scoresAt = (pixels) => softmax(atCells(logits, pixels, size), this.k);
+    return scoreHidden(view, projection, points, scoresAt(pixel), scoresAt);
   }
 
   /** Return the probabilities (n K) of points by the bird's-eye view. */
@@ -71,7 +72,7 @@ export class Networks {
     occupied.forEach((place, slot) => (slots[place] = slot));
     const logits = new Float32Array(pillar.length * this.k), scores = [];
     for (const part of partsOf(occupied)) {
-      const values = atPillars(decoded, part, size);
+      const values = atCells(decoded, part, size);
       scores.push(await this.run("polar_scores", [[values, [part.length, values.length / part.length]]]));
     }
     for (let i = 0; i < pillar.length; i++) {
@@ -89,11 +90,9 @@ export class Networks {
 
   /** Run a graph on inputs [[values, shape], ...]; return the values of its output. */
   async run(name, inputs) {
-    const feeds = {};
-    inputs.forEach(([values, shape], place) => {
-      feeds[this.description.graphs[name].inputs[place].name] = new this.ort.Tensor("float32", values, shape);
-    });
-    const output = Object.values(await this.sessions[name].run(feeds))[0], values = output.data.slice();
+    const names = this.description.graphs[name].inputs.map((input) => input.name);
+    const feeds = inputs.map(([values, shape], place) => [names[place], new this.ort.Tensor("float32", values, shape)]);
+    const output = Object.values(await this.sessions[name].run(Object.fromEntries(feeds)))[0], values = output.data.slice();
     output.dispose();
     return values;
   }

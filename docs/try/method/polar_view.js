@@ -47,11 +47,11 @@ export function toMap(values, pillars, size) {
   return map;
 }
 
-/** Return the values (m C) of a map (C, R A) at the pillars (m). */
-export function atPillars(map, pillars, size) {
-  const channels = map.length / size, values = new Float32Array(pillars.length * channels);
-  pillars.forEach((pillar, row) => {
-    for (let c = 0; c < channels; c++) values[row * channels + c] = map[c * size + pillar];
+/** Return the values (m C) of a map (C, size) at some cells (m). */
+export function atCells(map, cells, size) {
+  const channels = map.length / size, values = new Float32Array(cells.length * channels);
+  cells.forEach((cell, row) => {
+    for (let c = 0; c < channels; c++) values[row * channels + c] = map[c * size + cell];
   });
   return values;
 }

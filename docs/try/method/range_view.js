@@ -4,7 +4,7 @@ import { InputError } from "../errors.js";
 import { elevationOf, rowAt } from "../sensor/rows.js";
 
 const CHANNELS = 6;  // x, y, z, intensity, range, mask
-const WINDOW = 5;  // height and width of the window around a point's pixel, pixels
+const OFFSETS = [-2, -1, 0, 1, 2];  // the rows and columns of the window around a point's pixel
 const OWN_WEIGHT = 1e-3;  // the weight of a hidden point's own pixel
 
 /** Return the distance from the sensor to point i of points (4 n), metres, in float32 as in the training. */
@@ -19,26 +19,23 @@ export function cellOf(share, cells) {
 }
 
 /**
- * Project points (4 n) to a range image. Return {image, pixel, distances}: the image (6, H, W) in float32, the pixel (n)
- * of each point, counted row by row, and its distance (n) from the sensor. A pixel shows its point nearest to the sensor; of equally near points, the first.
+ * Project points (4 n) to a range image. Return {image, pixel}: the image (6, H, W) in float32, and the pixel (n) of
+ * each point, counted row by row. A pixel shows its point nearest to the sensor; of equally near points, the first.
  */
 export function rangeImage(view, points, rows) {
   const { height, width } = view, count = points.length / 4, plane = height * width;
   const image = new Float32Array(CHANNELS * plane), pixel = new Int32Array(count);
-  const distances = new Float32Array(count);
-  const nearest = new Float32Array(plane).fill(Infinity);
   checkRows(view, rows);
 
   for (let i = 0; i < count; i++) {
-    const [x, y, z, intensity] = points.subarray(4 * i, 4 * i + 4), distance = (distances[i] = distanceOf(points, i));
+    const [x, y, z, intensity] = points.subarray(4 * i, 4 * i + 4), distance = distanceOf(points, i);
     const column = cellOf(0.5 - Math.atan2(y, x) / (2 * Math.PI), width);
     const row = rows ? rows[i] : rowAt(elevationOf(x, y, z), view);
     const place = (pixel[i] = row * width + column);
-    if (distance < view.nearest || distance >= nearest[place]) continue;
-    nearest[place] = distance;
+    if (distance < view.nearest || (image[5 * plane + place] && distance >= image[4 * plane + place])) continue;
     [x, y, z, intensity, distance, 1].forEach((value, channel) => (image[channel * plane + place] = value));
   }
-  return { image, pixel, distances };
+  return { image, pixel };
 }
 
 function checkRows({ rows: kind, height }, rows) {
@@ -47,53 +44,28 @@ function checkRows({ rows: kind, height }, rows) {
   }
   if (!rows || rows.every((row) => row >= 0 && row < height)) return;
   const [low, high] = rows.reduce(([a, b], row) => [Math.min(a, row), Math.max(b, row)], [Infinity, -Infinity]);
-  throw new InputError(
-    `expected ring indices from 0 to ${height - 1}, found ${height - 1 - high} to ${height - 1 - low}; ` +
-    "use a model for this sensor",
-  );
-}
-
-/** Return the values (H W, K) of the pixels of an image (K, H, W). */
-export function byPixel(image, k) {
-  const plane = image.length / k, values = new Float32Array(image.length);
-  for (let c = 0; c < k; c++) {
-    for (let i = 0; i < plane; i++) values[i * k + c] = image[c * plane + i];
-  }
-  return values;
+  const found = `${height - 1 - high} to ${height - 1 - low}`;
+  throw new InputError(`expected ring indices from 0 to ${height - 1}, found ${found}; use a model for this sensor`);
 }
 
 /**
- * Return the probabilities (n K) of the points of a projection, given the probabilities (H W, K) of its pixels. A point
- * has the probabilities of its pixel. A hidden point, whose pixel shows another point more than `hidden` metres before
- * it, has the mean of the pixels around, weighted by how near to its own distance they show a point.
+ * Give the hidden points of a projection their probabilities, in `scores` (n K), which holds those of the points' pixels.
+ *
+ * A hidden point lies more than `hidden` metres behind the point that its pixel shows. It gets the mean of the pixels
+ * around it, weighted by how near to its own distance they show a point. `scoresAt` returns the probabilities of pixels.
  */
-export function toPoints({ height, width, hidden = 0 }, { image, pixel, distances }, scores, k) {
+export function scoreHidden({ height, width, hidden = 0 }, { image, pixel }, points, scores, scoresAt) {
   const plane = height * width, shown = image.subarray(4 * plane, 5 * plane), mask = image.subarray(5 * plane);
-  const values = new Float32Array(pixel.length * k);
   pixel.forEach((own, i) => {
-    const row = values.subarray(i * k, (i + 1) * k).fill(0);
-    let total = 0;
-    const add = (place, weight) => {
-      total += weight;
-      for (let c = 0; c < k; c++) row[c] += weight * scores[place * k + c];
-    };
-    const isHidden = hidden > 0 && mask[own] && Math.abs(shown[own] - distances[i]) > hidden;
-    add(own, isHidden ? OWN_WEIGHT : 1);
-    if (isHidden) {
-      for (const place of windowAround(own, height, width)) {
-        if (mask[place]) add(place, Math.exp(-(((shown[place] - distances[i]) / hidden) ** 2)));
-      }
-    }
-    for (let c = 0; c < k; c++) row[c] /= total;
-  });
-  return values;
-}
+    const distance = distanceOf(points, i), row = own - (own % width), k = scores.length / pixel.length;
+    if (!hidden || !mask[own] || Math.abs(shown[own] - distance) <= hidden) return;
 
-/** Return the pixels of the window around a pixel. It continues at the other end of the image, but not above or below. */
-function windowAround(pixel, height, width) {
-  const half = (WINDOW - 1) / 2, row = Math.floor(pixel / width), column = pixel % width, places = [];
-  for (let y = Math.max(row - half, 0); y <= Math.min(row + half, height - 1); y++) {
-    for (let x = column - half; x <= column + half; x++) places.push(y * width + ((x + width) % width));
-  }
-  return places;
+    // The window continues at the other end of the image. Above and below it, no pixel has a mask.
+    const window = OFFSETS.flatMap((y) => OFFSETS.map((x) => row + y * width + (((own % width) + x + width) % width)));
+    const around = [own, ...window.filter((place) => mask[place])], values = scoresAt(around);
+    const weights = around.map((place, n) => (n ? Math.exp(-(((shown[place] - distance) / hidden) ** 2)) : OWN_WEIGHT));
+    const total = weights.reduce((sum, weight) => sum + weight);
+    for (let c = 0; c < k; c++) scores[i * k + c] = weights.reduce((sum, weight, n) => sum + weight * values[n * k + c], 0) / total;
+  });
+  return scores;
 }
