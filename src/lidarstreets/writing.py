@@ -75,8 +75,9 @@ def simulate(
 ) -> Path:
     """Write labelled scans of procedural streets.
 
-    The same seed gives the same bytes on any number of processes. Sequences that an earlier call
-    has completed are kept.
+    The same seed gives the same bytes on any number of processes. A processor with other vector
+    instructions rounds the last bit differently, which may lead to other streets. Sequences that an
+    earlier call has completed are kept.
 
     Args:
         out: folder to write to, in the layout of SemanticKITTI (HDL-64E), nuScenes-lidarseg

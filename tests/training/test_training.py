@@ -649,6 +649,25 @@ def test_a_new_head_is_trained_on_the_networks_of_weights_with_another_one(
     assert "point_head.fc" in fail(*arguments, "--model.point_head.fc", 16)
 
 
+def test_the_networks_of_a_head_keep_their_settings_and_the_run_says_so(
+    world: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--stage", "head", "--init", run, "--training.head.epochs", 1)
+    weights = train(world, tmp_path / "same", *options)
+    assert "stays as in --init" not in capsys.readouterr().out
+
+    others = ("--model.range_view.hidden", 0.25, "--model.polar_view.vertical", 3)
+    weights = train(world, tmp_path / "other", *options, *others)
+    out = capsys.readouterr().out
+    begun = load(run).model
+    assert weights.model.range_view == begun.range_view
+    assert weights.model.polar_view == begun.polar_view
+    line = "range_net: is not trained, so it stays as in --init: model.range_view.hidden is"
+    assert f"{line} {begun.range_view.hidden:g}, not 0.25\n" in out
+    line = "polar_net: is not trained, so it stays as in --init: model.polar_view.vertical is"
+    assert f"{line} {begun.polar_view.vertical}, not 3\n" in out
+
+
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(
     world: Path, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch

@@ -9,6 +9,7 @@ from typing import Literal
 
 import lightning as L
 
+from amvnet.config.nested import flat, to_dict
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
 from amvnet.training.checking import check_data, keep_counts
@@ -29,7 +30,7 @@ from amvnet.training.run_folder import (
     write_record,
 )
 from amvnet.weights.file import Weights, save
-from amvnet.weights.parts import fits, for_classes, grown, replace_part, resized
+from amvnet.weights.parts import SIZES, fits, for_classes, grown, replace_part, resized
 
 
 def train(
@@ -134,10 +135,24 @@ def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> 
         begin = _grown(plan, init, part) if name in trained else init
         if init.taxonomy.classes == weights.taxonomy.classes:
             weights = replace_part(weights, part, begin)
+            if name not in trained:
+                _report_kept(plan, init, part)
         elif name in trained:
             weights = replace_part(weights, part, _for_classes(plan, begin, part))
 
     return _with_finished(plan, weights)
+
+
+def _report_kept(plan: Plan, init: Weights, part: str) -> None:
+    """Report the settings of a part that is not trained, if the recipe has others."""
+    of_recipe = dict(flat(to_dict(plan.recipe.model), "model"))
+    kept = []
+    for section in SIZES[part]:
+        for key, value in flat(to_dict(getattr(init.model, section)), f"model.{section}"):
+            if value != of_recipe[key]:
+                kept.append(f"{key} is {value}, not {of_recipe[key]}")
+    if kept:
+        plan.report(f"{part}: is not trained, so it stays as in --init: {'; '.join(kept)}")
 
 
 def _grown(plan: Plan, init: Weights, part: str) -> Weights:

@@ -31,7 +31,8 @@ def simulate(
             describes.
         sequences: number of sequences; each is another street.
         scans: number of scans in each sequence.
-        seed: the seed of all random numbers; the same seed gives the same bytes.
+        seed: the seed of all random numbers; the same seed gives the same bytes on the same kind of
+            processor.
         processes: number of sequences that are simulated at the same time; default: one per
             processor.
     """

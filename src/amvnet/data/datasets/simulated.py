@@ -49,9 +49,9 @@ class SimulatedStreets(Dataset):
     """Streets of a simulated sensor. `Dataset` documents the arguments and errors of its methods.
 
     A sequence is a street, named by its number: "000012". There are streets for all numbers up to
-    `LAST_STREET`. A street depends only on its number, and is simulated when one of its scans is
-    first read. Several processes may share the folder of the cache. If it exceeds `CACHE_BYTES`,
-    the streets that were read longest ago are removed.
+    `LAST_STREET`. On one kind of processor, a street depends only on its number. It is simulated
+    when one of its scans is first read. Several processes may share the folder of the cache. If it
+    exceeds `CACHE_BYTES`, the streets that were read longest ago are removed.
 
     Args:
         root: the folder of the cache, which is made if it does not exist.
