@@ -29,6 +29,8 @@ class Scan:
             no lasers.
         row: (N,) int64 row of each point in the range image of some weights (0 = top, -1 =
             unknown), or None. The range view computes rows that are unknown.
+        source: (N,) int64 index of the dataset that each point comes from (0 = the first),
+            or None. A training on several datasets sets it.
         name: the origin of the scan, for messages.
 
     Raises:
@@ -40,6 +42,7 @@ class Scan:
     ring: np.ndarray | None = None
     name: str = ""
     row: np.ndarray | None = None
+    source: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4:
@@ -51,6 +54,7 @@ class Scan:
         self._check_count("labels", self.labels)
         self._check_count("ring indices", self.ring)
         self._check_count("rows", self.row)
+        self._check_count("sources", self.source)
 
     def _check_count(self, kind: str, values: np.ndarray | None) -> None:
         """Raise InputError unless there is one value per point, or no values at all."""
@@ -89,6 +93,7 @@ class Scan:
             labels=None if self.labels is None else self.labels[which],
             ring=None if self.ring is None else self.ring[which],
             row=None if self.row is None else self.row[which],
+            source=None if self.source is None else self.source[which],
         )
 
     @property

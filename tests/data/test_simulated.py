@@ -267,7 +267,7 @@ def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
         names = []
         for batch in loader:
             assert isinstance(batch, tuple)
-            points, _ = batch
+            points, _, _ = batch
             for name, part in zip(points.names, points.slices(), strict=True):
                 names.append(name)
                 key = keys[len(names) - 1]

@@ -26,12 +26,14 @@ from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.normalise import Normaliser
 from amvnet.sensors.record import AS_IS_KEY, SENSOR_KEY
 from amvnet.training.augment import mix
-from amvnet.training.loaders import ScanSet
+from amvnet.training.checking import check_data
+from amvnet.training.loaders import ScanSet, collate
 from amvnet.training.plan import (
+    Plan,
     open_for_training,
     open_parts,
     sized_by_init,
-    without_weight_averaging,
+    without_initial_weights,
 )
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights, load, save
@@ -39,6 +41,8 @@ from amvnet.weights.file import Weights, load, save
 from fixtures.commands import refusal, run_cli
 from fixtures.own_scans import make_own_scans
 from fixtures.tiny import (
+    BUILDING,
+    CAR,
     GOLDEN,
     fresh_weights,
     make_streets,
@@ -94,6 +98,43 @@ def test_a_mixed_scan_is_read_from_its_own_dataset(tmp_path: Path) -> None:
     scan = scans.dataset.read(record)
     np.testing.assert_array_equal(scan.points, expected.points)
     np.testing.assert_array_equal(scan.labels, expected.labels)
+
+
+def test_points_keep_their_dataset_as_their_source_when_scans_are_mixed(tmp_path: Path) -> None:
+    scans = joined(tmp_path, 0.5)
+    own, other = scans.train[0], scans.train[-1]
+    assert isinstance(other, MixedRecord)
+    parts = []
+    for record, label in ((own, 3), (other, 9)):
+        scan = scans.dataset.read(record)
+        parts.append(replace(scan, labels=np.full(len(scan), label, np.uint8)))
+    mixed = mix(parts[0], parts[1], np.random.default_rng(0))
+    _, labels, source = collate([mixed])
+    assert set(zip(labels.tolist(), source.tolist(), strict=True)) == {(3, 0), (9, 1)}
+
+
+def test_the_check_finds_the_classes_that_only_other_datasets_have(tmp_path: Path) -> None:
+    make_streets(tmp_path / "a", ("00", "08"), 4)
+    for path in (tmp_path / "a").rglob("*.label"):
+        raw = np.fromfile(path, np.uint32)
+        raw[raw == CAR] = BUILDING
+        raw.tofile(path)
+    a = open_dataset(str(tmp_path / "a"))
+    b = open_dataset(str(make_streets(tmp_path / "b", ("00",), 14)))
+    own = TrainingScans(a, a.records(["00"]), [])
+    lines: list[str] = []
+    plan = Plan(
+        load_recipe("semantickitti-compact"),
+        join(own, [TrainingScans(b, b.records(["00"]), [])], 0.5),
+        tmp_path / "run",
+        report=lines.append,
+    )
+    _, present = check_data(plan)
+    car = SEMANTICKITTI.classes.index("car")
+    assert present[:, car].tolist() == [False, True]
+    assert present[0].sum() == present[1].sum() - 1
+    (line,) = [line for line in lines if "other --data" in line]
+    assert line.startswith(f"train: car: learnt from the other --data alone; the scans of {a.spec}")
 
 
 def test_scans_that_are_mixed_into_others_are_of_the_same_epoch(
@@ -235,15 +276,36 @@ def test_the_mean_with_initial_weights_needs_their_classes() -> None:
     assert recipe.training.rv.initial > 0
     lines: list[str] = []
     for init in (None, fresh_weights()):
-        assert without_weight_averaging(recipe, init, SEMANTICKITTI, lines.append) is recipe
+        assert without_initial_weights(recipe, init, SEMANTICKITTI, lines.append) is recipe
     assert not lines
 
-    training = without_weight_averaging(
+    training = without_initial_weights(
         recipe, fresh_weights(NUSCENES), SEMANTICKITTI, lines.append
     ).training
     assert training.rv.initial == training.bev.initial == 0
     assert training.rv.lr == recipe.training.rv.lr
     assert [line.split(":")[0] for line in lines] == ["rv", "bev"]
+
+
+def test_a_training_distils_what_one_of_its_datasets_lacks_and_says_so(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_streets(tmp_path / "b", ("00",), 3)
+    for path in (tmp_path / "b").rglob("*.label"):
+        raw = np.fromfile(path, np.uint32)
+        raw[raw == CAR] = BUILDING
+        raw.tofile(path)
+
+    trained = []
+    for name, distill in (("with", 5), ("without", 0)):
+        command = arguments(world, tmp_path / name, str(tmp_path / "b"))
+        options = ("--training.rv.distill", distill, "--training.others", 0.4, "--stage", "rv")
+        assert run_cli(*command, *options) == (0, "")
+        out = capsys.readouterr().out
+        assert "train: car: learnt from the other --data alone" in out
+        assert ("rv: keeps what --init knows" in out) == (distill > 0)
+        trained.append(load(tmp_path / name).part("range_net")["scores.bias"])
+    assert (trained[0] != trained[1]).any()
 
 
 def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(

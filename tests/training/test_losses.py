@@ -16,9 +16,11 @@ from amvnet.training.losses import (
     Targets,
     class_weights,
     dice,
+    distillation_loss,
     lovasz_softmax,
     majority_labels,
     network_loss,
+    rival_classes,
 )
 
 K = 5
@@ -154,6 +156,106 @@ def test_the_loss_of_a_batch_is_the_mean_over_its_scans_and_so_is_its_gradient(
     assert scans[2] == 0
     torch.testing.assert_close(batch, mean)
     torch.testing.assert_close(gradient, expected)
+
+
+def test_a_class_that_one_dataset_lacks_has_no_rivals_there() -> None:
+    present = np.array([[1, 0, 0, 1], [1, 1, 0, 0]], bool)
+    rivals = rival_classes(present)
+    assert rivals is not None
+    # No dataset has the third class, so that all points count against it.
+    assert rivals.tolist() == [[True, False, True, True], [True, True, True, False]]
+    assert rival_classes(present[:1]) is None
+    assert rival_classes(np.ones((2, 4), bool)) is None
+
+
+@LOSSES
+def test_points_of_a_dataset_ignore_the_classes_that_it_lacks(region_loss: RegionLoss) -> None:
+    """The loss of a scan equals the loss without the columns of these classes."""
+    logits, labels = example(points=200, classes=7)
+    labels[labels == 2] = 1  # the dataset lacks the classes 2 and 5
+    labels[labels == 5] = 4
+    kept = torch.tensor([0, 2, 3, 5, 6])
+    weights = torch.rand(7) + 0.1
+    scan = torch.zeros(200, dtype=torch.long)
+    rivals = torch.ones(2, 7, dtype=torch.bool)
+    rivals[1, [1, 4]] = False
+    logits.requires_grad_()
+
+    scored = Scored(logits, labels, scan, scans=1, source=torch.ones_like(scan))
+    loss = network_loss(scored, weights, 0.7, region_loss, rivals)
+    position = torch.zeros(8, dtype=torch.long)
+    position[kept + 1] = torch.arange(1, 6)
+    expected = loss_of(region_loss, logits[:, kept], position[labels], weights[kept], 0.7)
+    torch.testing.assert_close(loss, expected)
+    (gradient,) = torch.autograd.grad(loss, logits)
+    (of_kept,) = torch.autograd.grad(expected, logits)
+    torch.testing.assert_close(gradient, of_kept)
+
+    # With points of the other dataset, nothing changes.
+    other = Scored(logits, labels, scan, scans=1, source=scan)
+    torch.testing.assert_close(
+        network_loss(other, weights, 0.7, region_loss, rivals),
+        loss_of(region_loss, logits, labels, weights, 0.7),
+    )
+
+
+@LOSSES
+def test_a_point_of_a_class_that_its_dataset_lacks_has_a_finite_loss(
+    region_loss: RegionLoss,
+) -> None:
+    """Such as a voxel that has points of two datasets."""
+    logits, labels = example(points=50)
+    scan = torch.zeros(50, dtype=torch.long)
+    scored = Scored(logits.requires_grad_(), labels, scan, scans=1, source=scan)
+    loss = network_loss(scored, None, 1, region_loss, torch.zeros(1, K, dtype=torch.bool))
+    (gradient,) = torch.autograd.grad(loss, logits)
+    assert loss.isfinite()
+    assert gradient.isfinite().all()
+
+
+def test_a_distillation_is_the_cross_entropy_of_the_classes_left_out_and_the_others() -> None:
+    """The mean over scans of the mean over their labelled points, in a plain loop."""
+    logits, labels = example(points=90, classes=6)
+    teacher, _ = example(points=90, classes=6, seed=1)
+    labels[:5] = 3  # a class that dataset 1 lacks, as in a voxel with points of two datasets
+    scan = torch.arange(90) % 3
+    source = (torch.arange(90) % 6 < 4).long()
+    rivals = torch.ones(2, 6, dtype=torch.bool)
+    left_out = [2, 4]
+    rivals[1, left_out] = False
+    scored = Scored(logits.requires_grad_(), labels, scan, scans=3, source=source)
+
+    scans = []
+    for number in range(3):
+        losses = []
+        for p in range(90):
+            label = int(labels[p])
+            if scan[p] != number or source[p] == 0 or label == 0 or label - 1 in left_out:
+                continue
+            student, target = logits[p].softmax(0), teacher[p].softmax(0)
+            rest, target_rest = 1 - student[left_out].sum(), 1 - target[left_out].sum()
+            loss = -(target[left_out] * student[left_out].log()).sum()
+            losses.append(loss - target_rest * rest.log())
+        scans.append(torch.stack(losses).mean() if losses else torch.zeros(()))
+    loss = distillation_loss(scored, teacher, rivals)
+    torch.testing.assert_close(loss, torch.stack(scans).mean())
+
+
+def test_a_distillation_pulls_only_points_of_datasets_that_lack_classes() -> None:
+    logits, labels = example(points=40)
+    scan = torch.zeros(40, dtype=torch.long)
+    rivals = torch.tensor([[True] * K, [True] * (K - 1) + [False]])
+    gradients = []
+    for source, teacher in ((0, torch.zeros(40, K)), (1, torch.zeros(40, K)), (1, logits)):
+        student = logits.clone().requires_grad_()
+        scored = Scored(student, labels, scan, scans=1, source=torch.full_like(scan, source))
+        (gradient,) = torch.autograd.grad(distillation_loss(scored, teacher, rivals), student)
+        gradients.append(gradient)
+    assert (gradients[0] == 0).all()
+    assert (gradients[1][labels > 0].abs().sum(dim=1) > 0).all()
+    assert (gradients[1][labels == 0] == 0).all()
+    # A network that gives the teacher's probabilities stays as it is.
+    torch.testing.assert_close(gradients[2], torch.zeros(40, K))
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -22,7 +22,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import simulated_intensity
 from amvnet.training.loaders import ScanSet
-from amvnet.training.losses import Targets, dice, lovasz_softmax
+from amvnet.training.losses import Targets, dice, distillation_loss, lovasz_softmax, rival_classes
 from amvnet.training.networks import PolarStage, make_loaders, make_stage
 from amvnet.training.plan import Plan
 
@@ -42,7 +42,7 @@ def plan_with(config: NetworkTraining) -> Plan:
 def polar_stage() -> PolarStage:
     torch.manual_seed(0)
     model = build_amvnet(MODEL_CONFIG, SEMANTICKITTI.size)
-    shared = {"config": CONFIG, "taxonomy": SEMANTICKITTI}
+    shared: Any = {"config": CONFIG, "taxonomy": SEMANTICKITTI}
     return PolarStage(model.polar_view, model.polar_net.eval(), None, **shared)
 
 
@@ -78,6 +78,77 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
         rows = voxels.logits[of_scan].tolist()
         voxel_labels = voxels.labels[of_scan].tolist()
         assert sorted(zip(rows, voxel_labels, strict=True)) == sorted(expected)
+
+
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+def test_pixels_and_voxels_have_the_source_of_their_points(stage: str) -> None:
+    """The source is the scan here, so that no pixel and no voxel has points of two sources."""
+    batch, labels = batch_of_two()
+    made = make_stage(plan_with(CONFIG), stage, build_amvnet(MODEL_CONFIG, 19), None).eval()
+    with torch.no_grad():
+        scored = made.compare(batch, labels, batch.scan)
+    assert scored.source is not None
+    assert set(scored.source.tolist()) == {0, 1}
+    assert scored.source.tolist() == scored.scan.tolist()
+
+
+def test_a_voxel_with_points_of_two_datasets_has_the_first_as_its_source() -> None:
+    scan = Scan(np.array([[9, 0, 0, 1], [9.01, 0, 0, 1], [30, 0, 0, 1]], np.float32))
+    with torch.no_grad():
+        scored = polar_stage().compare(
+            PointBatch.of([scan]), torch.tensor([1, 1, 2]), torch.tensor([2, 1, 2])
+        )
+    assert scored.source is not None
+    assert dict(zip(scored.labels.tolist(), scored.source.tolist(), strict=True)) == {1: 1, 2: 2}
+
+
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> None:
+    present = np.ones((2, 19), bool)
+    present[0, 4] = False
+    model = build_amvnet(MODEL_CONFIG, 19)
+    made: Any = make_stage(plan_with(CONFIG), stage, model, None, rival_classes(present)).eval()
+    made.log = lambda *_, **__: None
+    made.step_factor = lambda *_: 1.0
+    batch, labels = batch_of_two()
+    labels[labels == 5] = 1
+
+    gradients = []
+    for number in range(2):
+        made.zero_grad()
+        made.training_step((batch, labels, torch.full_like(labels, number)), 0).backward()
+        gradients.append(made.trained.scores.bias.grad.unflatten(0, (-1, 19)).clone())
+    assert (gradients[0][:, 4] == 0).all()
+    assert (gradients[1][:, 4] > 0).any()
+    assert (gradients[0][:, 5] > 0).any()
+
+
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(stage: str) -> None:
+    config = replace(CONFIG, distill=2.0)
+    present = np.ones((2, 19), bool)
+    assert not make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), None).teachers
+    present[0, 4] = False
+    rivals = rival_classes(present)
+    made: Any = make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), None, rivals)
+    made.log = lambda *_, **__: None
+    made.step_factor = lambda *_: 1.0
+    (teacher,) = made.teachers
+    assert not any(value.requires_grad for value in teacher.parameters())
+    assert {name.split(".")[0] for name in made.state_dict()} == {"trained"}
+
+    batch, labels = batch_of_two()
+    labels[labels == 5] = 1
+    made.trained.scores.bias.data += torch.randn(len(made.trained.scores.bias))
+    made.eval()
+    source = torch.zeros_like(labels)
+    with torch.no_grad():
+        scored = made.compare(batch, labels, source)
+        expected = made.compare(batch, labels, net=teacher).logits
+        distillation = distillation_loss(scored, expected, made.rivals)
+        loss = made.training_step((batch, labels, source), 0)
+    assert (scored.logits != expected).any()
+    assert loss == made.loss(scored) + 2 * distillation
 
 
 def test_the_loss_over_voxels_learns() -> None:

@@ -182,7 +182,7 @@ def test_the_check_of_the_scans_reports_ten_times_and_only_once(
     scans = TrainingScans(dataset, dataset.records(["00"]), [])
     lines: list[str] = []
     plan = Plan(load_recipe("semantickitti-compact"), scans, tmp_path / "run", report=lines.append)
-    counts = [check_data(plan).tolist() for _ in range(2)]  # the second time from the cache
+    counts = [check_data(plan)[0].tolist() for _ in range(2)]  # the second time from the cache
     assert counts[0] == counts[1]
     checked = [line for line in lines if line.startswith("checked")]
     assert len(checked) == 10
@@ -333,10 +333,13 @@ def test_a_share_of_the_initial_weights_is_kept_and_resumes_to_the_bit(
     assert not differing(train(world, tmp_path / "cut", *averaged, "--resume"), whole)
 
 
-def test_no_initial_weights_to_keep_a_share_of_is_one_line(world: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("option", ["initial", "distill"])
+def test_no_initial_weights_to_keep_or_distil_is_one_line(
+    world: Path, tmp_path: Path, option: str
+) -> None:
     code, error = run_cli(
         *("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run"),
-        *("--training.rv.initial", 0.5),
+        *(f"--training.rv.{option}", 0.5),
     )
     assert code == 2
     assert "--init" in error

@@ -319,6 +319,9 @@ class NetworkTraining(Checked):
     average."""
     initial: Share = 0.0
     """Share of the initial weights of `--init` in the result, which is a mean (open)."""
+    distill: Factor = 0.0
+    """Weight of the distillation (not in the paper). If one of several datasets lacks a class, it
+    keeps the probabilities that the network of `--init` gives the class there."""
     accumulate: Scans = 1
     """Number of parts into which each process splits a batch that does not fit into memory."""
 

@@ -291,6 +291,7 @@ def _join(scan: Scan, other: Scan) -> Scan:
         labels=_join_labels(scan, other),
         ring=_join_indices(scan.ring, other.ring, scan, other),
         row=_join_indices(scan.row, other.row, scan, other),
+        source=_join_indices(scan.source, other.source, scan, other),
     )
 
 
@@ -303,7 +304,7 @@ def _join_labels(scan: Scan, other: Scan) -> np.ndarray | None:
 def _join_indices(
     first: np.ndarray | None, second: np.ndarray | None, scan: Scan, other: Scan
 ) -> np.ndarray | None:
-    """Return the rings or rows of both scans. Points of a scan without them get -1."""
+    """Return the rings, rows or sources of both scans. Points of a scan without them get -1."""
     if first is None and second is None:
         return None
     if first is None:

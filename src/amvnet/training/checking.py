@@ -13,17 +13,19 @@ from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.progress import Tenths, counted
+from amvnet.training.losses import rival_classes
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import COUNTS
 
 SHOWN_SCANS = 3  # largest number of broken scans that a message names
 
 
-def check_data(plan: Plan) -> np.ndarray:
+def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """Check all labels of the scans of a training, and report what may be a mistake.
 
     Returns:
-        (K,) int64, the number of points of each class in the training scans of an epoch.
+        (K,) int64, the number of points of each class in the training scans of an epoch; and
+        (M, K) bool, whether the training scans of each of M datasets have points of each class.
 
     Raises:
         InputError: if a label has an unknown id, a scan cannot be read, or there is nothing to
@@ -36,6 +38,8 @@ def check_data(plan: Plan) -> np.ndarray:
             size = plan.processes.size
             plan.report(f"checked {min(done * size, total * size)} of {total * size} scans")
 
+    specs = []
+    present = []
     totals = np.zeros(plan.scans.dataset.taxonomy.size + 1, dtype=np.int64)
     for dataset, splits, counted_records in _datasets_of(plan):
         checked = check_scans(dataset, splits, progress, plan.processes)
@@ -43,7 +47,20 @@ def check_data(plan: Plan) -> np.ndarray:
         for line in checked.warnings():
             plan.report(line)
         totals += checked.count_points(counted_records)
-    return totals[1:]
+        specs.append(checked.spec)
+        present.append(checked.splits["train"].points[1:] > 0)
+
+    classes = plan.scans.dataset.taxonomy.classes
+    rivals = rival_classes(np.array(present))
+    if rivals is not None:
+        for spec, row in zip(specs, rivals, strict=True):
+            absent = [classes[index] for index in np.flatnonzero(~row)]
+            if absent:
+                plan.report(
+                    f"train: {', '.join(absent)}: learnt from the other --data alone; the scans of "
+                    f"{spec} have no such point, so they do not count against these classes"
+                )
+    return totals[1:], np.array(present)
 
 
 def keep_counts(plan: Plan, counts: np.ndarray) -> None:

@@ -314,7 +314,7 @@ class PointGatherer:
         device = self._device
         seeds = [self.plan.recipe.training.seed, *key]
         scan = scans[key]
-        batch, labels = collate([scan])
+        batch, labels, _ = collate([scan])
         batch = batch.to(device)
         labels = labels.to(device)
 

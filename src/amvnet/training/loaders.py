@@ -168,15 +168,29 @@ class EpochSampler(EpochOrder):
             yield self.epoch, index
 
 
-def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
-    """Return the valid points of labelled scans, and their (P,) int64 train ids."""
-    labels = [scan.labels[scan.valid] for scan in scans if scan.labels is not None]
-    return PointBatch.of(scans), torch.from_numpy(np.concatenate(labels).astype(np.int64))
+def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor, Tensor]:
+    """Return the P valid points of labelled scans, their train ids and their sources, (P,) int64.
+
+    Points of an unknown source have the source 0.
+    """
+    labels = []
+    sources = []
+    for scan in scans:
+        assert scan.labels is not None
+        valid = scan.valid
+        labels.append(scan.labels[valid])
+        source = np.zeros(len(scan), np.int64) if scan.source is None else scan.source
+        sources.append(source[valid])
+    return (
+        PointBatch.of(scans),
+        torch.from_numpy(np.concatenate(labels).astype(np.int64)),
+        torch.from_numpy(np.concatenate(sources)),
+    )
 
 
 def make_loader(
     scans: ScanSet, batch: int, workers: int, shuffle: bool, processes: Processes = ALONE
-) -> data.DataLoader[tuple[PointBatch, Tensor]]:
+) -> data.DataLoader[tuple[PointBatch, Tensor, Tensor]]:
     """Make a loader of this process's batches. The last batch of an epoch may be smaller.
 
     Args:

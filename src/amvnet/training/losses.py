@@ -42,6 +42,23 @@ def class_weights(counts: NDArray[np.number]) -> NDArray[np.float32]:
     return scaled
 
 
+def rival_classes(present: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    """Return which classes the points of each dataset count against.
+
+    A dataset without a point of a class cannot teach what does not belong to the class. If another
+    dataset has the class, the points of the first do not count against it: otherwise, the networks
+    would learn that the class never occurs with the first dataset's sensor.
+
+    Args:
+        present: (M, K) whether each of M datasets has points of each class.
+
+    Returns:
+        (M, K) bool, or None if all points count against all classes.
+    """
+    rivals = present | ~present.any(axis=0)
+    return None if rivals.all() else rivals
+
+
 @dataclass(frozen=True)
 class Scored:
     """The P points, pixels or voxels of a batch of scans that a loss compares with their labels.
@@ -51,12 +68,14 @@ class Scored:
         labels: (P,) train ids; 0 is ignored.
         scan: (P,) index of the scan in the batch, 0..scans - 1.
         scans: B, the number of scans.
+        source: (P,) index of the dataset, or None if it is not needed.
     """
 
     logits: Tensor
     labels: Tensor
     scan: Tensor
     scans: int
+    source: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -96,7 +115,11 @@ RegionLoss = Callable[[Tensor, Targets], Tensor]  # takes (P, K) probabilities, 
 
 
 def network_loss(
-    scored: Scored, weights: Tensor | None, region: float, region_loss: RegionLoss
+    scored: Scored,
+    weights: Tensor | None,
+    region: float,
+    region_loss: RegionLoss,
+    rivals: Tensor | None = None,
 ) -> Tensor:
     """Return the mean over scans of cross-entropy + a region loss.
 
@@ -105,6 +128,8 @@ def network_loss(
         weights: (K,) class weights of the cross-entropy, or None for equal weights.
         region: weight of the region loss. The weight of the cross-entropy is 1.
         region_loss: `dice` or `lovasz_softmax`.
+        rivals: (M, K) bool, which classes the points of each of M datasets count against besides
+            their own class; None for all classes. `scored` must have sources then.
 
     Returns:
         The loss: a scalar of type float32, or float64 if the logits have it. The loss of a scan
@@ -115,6 +140,11 @@ def network_loss(
     logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
     classes = scored.labels.index_select(0, labelled).long() - 1
     scan = scored.scan.index_select(0, labelled)
+    if rivals is not None:
+        assert scored.source is not None
+        competes = rivals[scored.source.index_select(0, labelled)]
+        competes = competes.scatter(1, classes[:, None], True)
+        logits = logits.masked_fill(~competes, -torch.inf)
     targets = Targets.of(classes, scan, (scored.scans, logits.shape[1]))
 
     # The share of a point in the loss of its scan is proportional to the weight of its class.
@@ -124,6 +154,40 @@ def network_loss(
     shares = weight_of_class[classes] / (totals[scan] * scored.scans)
     cross_entropy = (F.cross_entropy(logits, classes, reduction="none") * shares).sum()
     return cross_entropy + region * region_loss(logits.softmax(dim=1), targets)
+
+
+def distillation_loss(scored: Scored, teacher: Tensor, rivals: Tensor) -> Tensor:
+    """Return the mean over scans of the loss that keeps the classes that a dataset lacks.
+
+    The points of such a dataset do not count against these classes (`rival_classes`), but they
+    raise the scores of all others. This loss is the cross-entropy between the probabilities of the
+    teacher and of the network for the classes that are left out and, as one class, all others. It
+    follows learning without forgetting (Li and Hoiem, 2016).
+
+    Args:
+        scored: the points, pixels or voxels, with sources.
+        teacher: (P, K) logits of the initial network for the same points.
+        rivals: (M, K) bool, as `network_loss` takes it.
+
+    Returns:
+        The loss: a scalar. The loss of a scan without points of such a dataset is 0.
+    """
+    assert scored.source is not None
+    classes = (scored.labels - 1).clamp_min(0)[:, None]
+    competes = rivals[scored.source]
+    learns = (scored.labels > 0) & ~competes.all(dim=1) & competes.gather(1, classes)[:, 0]
+    index = learns.nonzero()[:, 0]
+    others = competes.index_select(0, index)  # (N, K) bool, the classes that are not left out
+    scan = scored.scan.index_select(0, index)
+
+    log = scored.logits.index_select(0, index).float().log_softmax(dim=1)
+    target = teacher.index_select(0, index).float().softmax(dim=1)
+    log_of_others = log.masked_fill(~others, -torch.inf).logsumexp(dim=1)
+    losses = -(target * log).masked_fill(others, 0).sum(dim=1)
+    losses = losses - target.masked_fill(~others, 0).sum(dim=1) * log_of_others
+
+    counts = torch.bincount(scan, minlength=scored.scans)
+    return (losses / (counts[scan] * scored.scans)).sum()
 
 
 def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,11 @@ from amvnet.training.losses import (
     Scored,
     class_weights,
     dice,
+    distillation_loss,
     lovasz_softmax,
     majority_labels,
     network_loss,
+    rival_classes,
 )
 from amvnet.training.muon import Muon
 from amvnet.training.plan import Plan
@@ -34,7 +37,7 @@ from amvnet.training.run_folder import PART_OF
 from amvnet.training.stage import Loaders, Stage, fit
 from amvnet.weights.file import Weights
 
-Batch = tuple[PointBatch, Tensor]  # points, and their (P,) train ids
+Batch = tuple[PointBatch, Tensor, Tensor]  # points, their (P,) train ids and (P,) sources
 REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 
 
@@ -47,6 +50,10 @@ class NetworkStage(Stage):
         view: the projection.
         net: the network, which takes what the projection returns.
         weights: (K,) class weights of the loss, or None for equal weights.
+        rivals: (M, K) bool, which classes the points of each dataset count against
+            (`rival_classes`), or None for all.
+        teacher: the initial network, if its probabilities are to be kept for the classes that a
+            dataset lacks (`distillation_loss`).
         shared: the arguments of `Stage`.
     """
 
@@ -59,24 +66,38 @@ class NetworkStage(Stage):
         view: RangeView | PolarView,
         net: nn.Module,
         weights: np.ndarray | None,
+        rivals: np.ndarray | None = None,
+        teacher: nn.Module | None = None,
         **shared: Any,
     ) -> None:
         super().__init__(**shared)
+        # In a tuple, the teacher is not a part of the stage, so that no checkpoint holds it.
+        self.teachers = () if teacher is None else (teacher.eval().requires_grad_(False),)
         self.view = view
         self.trained = net
         self.class_weights: Tensor | None
-        tensor = None if weights is None else torch.from_numpy(weights)
-        self.register_buffer("class_weights", tensor, persistent=False)
+        self.rivals: Tensor | None
+        for name, values in (("class_weights", weights), ("rivals", rivals)):
+            tensor = None if values is None else torch.from_numpy(values)
+            self.register_buffer(name, tensor, persistent=False)
         # The number of batches in the epoch, and the number of batches with a labelled point.
         self.batches = 0
         self.labelled: Tensor | int = 0
 
-    def compare(self, batch: PointBatch, labels: Tensor) -> Scored:
+    def compare(
+        self,
+        batch: PointBatch,
+        labels: Tensor,
+        source: Tensor | None = None,
+        net: nn.Module | None = None,
+    ) -> Scored:
         """Return the pixels or voxels that the loss compares with their labels.
 
         Args:
             batch: the P valid points of some scans.
             labels: (P,) train ids.
+            source: (P,) index of the dataset of each point, or None if it is not needed.
+            net: the network; by default the trained one.
         """
         raise NotImplementedError
 
@@ -87,12 +108,25 @@ class NetworkStage(Stage):
     def loss(self, scored: Scored) -> Tensor:
         """Return the mean loss over the scans, so that a batch may be split into parts."""
         region_loss = REGION_LOSSES.get(self.config.region_loss, self.default_region_loss)
-        return network_loss(scored, self.class_weights, self.config.region, region_loss)
+        weights = self.class_weights
+        return network_loss(scored, weights, self.config.region, region_loss, self.rivals)
+
+    def distillation(
+        self, teacher: nn.Module, batch: PointBatch, labels: Tensor, scored: Scored
+    ) -> Tensor:
+        """Return the `distillation_loss` of a batch."""
+        assert self.rivals is not None
+        teacher.to(batch.points)  # their type and device
+        with torch.no_grad():
+            expected = self.compare(batch, labels, net=teacher)
+        return distillation_loss(scored, expected.logits, self.rivals)
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
-        points, labels = batch
-        scored = self.compare(points, labels)
+        points, labels, source = batch
+        scored = self.compare(points, labels, None if self.rivals is None else source)
         loss = self.loss(scored)
+        for teacher in self.teachers:
+            loss = loss + self.config.distill * self.distillation(teacher, points, labels, scored)
         self.batches += 1
         self.labelled += (scored.labels > 0).any().int()  # a tensor, so that a GPU need not wait
 
@@ -117,7 +151,7 @@ class NetworkStage(Stage):
             )
 
     def validation_step(self, batch: Batch, index: int) -> None:
-        points, labels = batch
+        points, labels, _ = batch
         prediction = (self.score(points).argmax(dim=1) + 1).cpu().numpy()
         self.matrix += confusion(labels.cpu().numpy(), prediction, self.taxonomy.size)
 
@@ -163,18 +197,26 @@ class RangeStage(NetworkStage):
     view: RangeView
     default_region_loss = staticmethod(dice)
 
-    def compare(self, batch: PointBatch, labels: Tensor) -> Scored:
+    def compare(
+        self,
+        batch: PointBatch,
+        labels: Tensor,
+        source: Tensor | None = None,
+        net: nn.Module | None = None,
+    ) -> Scored:
         view = self.view.project(batch)
-        image = self.trained(view.image)  # (B, K, H, W)
+        image = (net or self.trained)(view.image)  # (B, K, H, W)
         pixels = image.permute(0, 2, 3, 1).flatten(0, 2)  # (B * H * W, K)
 
         # Pixels without a point have no label.
         index = (view.nearest >= 0).nonzero()[:, 0]
+        shown = view.nearest[index]
         return Scored(
             logits=pixels.index_select(0, index),
-            labels=labels[view.nearest[index]],
+            labels=labels[shown],
             scan=index // (len(pixels) // batch.count),
             scans=batch.count,
+            source=None if source is None else source[shown],
         )
 
     def score(self, batch: PointBatch) -> Tensor:
@@ -189,22 +231,31 @@ class PolarStage(NetworkStage):
     view: PolarView
     default_region_loss = staticmethod(lovasz_softmax)
 
-    def compare(self, batch: PointBatch, labels: Tensor) -> Scored:
+    def compare(
+        self,
+        batch: PointBatch,
+        labels: Tensor,
+        source: Tensor | None = None,
+        net: nn.Module | None = None,
+    ) -> Scored:
         view = self.view.project(batch)
-        return _score_voxels(view, self.trained(view), labels)
+        return _score_voxels(view, (net or self.trained)(view), labels, source)
 
     def score(self, batch: PointBatch) -> Tensor:
         view = self.view.project(batch)
         return view.to_points(self.trained(view))
 
 
-def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
+def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tensor | None) -> Scored:
     """Return the voxels that have points, each with the most frequent label of its points.
+
+    A voxel with points of several datasets has the first of them as its source.
 
     Args:
         view: the grids of B scans.
         scores: (M, Z * K) logits of the M pillars that have points.
         labels: (P,) train ids.
+        source: (P,) index of the dataset of each point, or None.
     """
     scans, radial, angular, vertical = view.shape
     logits = scores.unflatten(1, (vertical, -1)).flatten(0, 1)  # (M * Z, K)
@@ -214,7 +265,11 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
     voxel_labels = majority_labels(cells, labels, count=len(voxels), classes=classes)
 
     scan = view.occupied[voxels // vertical] // (radial * angular)
-    return Scored(logits=voxel_logits, labels=voxel_labels, scan=scan, scans=scans)
+    if source is not None:
+        source = source.new_zeros(len(voxels)).scatter_reduce_(
+            0, cells, source, "amin", include_self=False
+        )
+    return Scored(logits=voxel_logits, labels=voxel_labels, scan=scan, scans=scans, source=source)
 
 
 def train_network(plan: Plan, name: str, weights: Weights) -> None:
@@ -230,11 +285,12 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
             is too small.
     """
     config = getattr(plan.recipe.training, name)
-    if config.initial and PART_OF[name] not in weights.parts:
-        raise InputError(
-            f"training.{name}.initial: expected weights to begin with, found none; give "
-            "--init, or set it to 0"
-        )
+    for option in ("initial", "distill"):
+        if getattr(config, option) and PART_OF[name] not in weights.parts:
+            raise InputError(
+                f"training.{name}.{option}: expected weights to begin with, found none; give "
+                "--init, or set it to 0"
+            )
 
     model = plan.build(weights)
     intensity = _intensity(plan, weights)
@@ -244,7 +300,10 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     if config.class_weights:
         assert plan.class_counts is not None
         loss_weights = class_weights(plan.class_counts)
-    stage = make_stage(plan, name, model, loss_weights)
+    rivals = None if plan.present is None else rival_classes(plan.present)
+    stage = make_stage(plan, name, model, loss_weights, rivals)
+    if stage.teachers:
+        plan.report(f"{name}: keeps what --init knows of classes that a dataset lacks (distill)")
     try:
         fit(stage, plan, loaders, weights, intensity)
     except torch.OutOfMemoryError:
@@ -255,24 +314,31 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
 
 
 def make_stage(
-    plan: Plan, name: str, model: AMVNet, weights: np.ndarray | None
+    plan: Plan,
+    name: str,
+    model: AMVNet,
+    weights: np.ndarray | None,
+    rivals: np.ndarray | None = None,
 ) -> RangeStage | PolarStage:
     """Return the stage `rv` or `bev` of a model.
 
     Args:
         weights: (K,) class weights of the loss, or None for equal weights.
+        rivals: (M, K) bool, which classes the points of each dataset count against; None for all.
     """
     config = getattr(plan.recipe.training, name)
     shared: dict[str, Any] = {
         "config": config,
         "taxonomy": plan.scans.dataset.taxonomy,
-        "weights": weights,
         "processes": plan.processes,
         "report": plan.report,
     }
+    net = model.range_net if name == "rv" else model.polar_net
+    distils = config.distill and rivals is not None
+    shared |= {"rivals": rivals, "teacher": copy.deepcopy(net) if distils else None}
     if name == "rv":
-        return RangeStage(model.range_view, model.range_net, **shared)
-    return PolarStage(model.polar_view, model.polar_net, **shared)
+        return RangeStage(model.range_view, net, weights, **shared)
+    return PolarStage(model.polar_view, net, weights, **shared)
 
 
 def make_loaders(

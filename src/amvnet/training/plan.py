@@ -44,6 +44,8 @@ class Plan:
             ignored.
         class_counts: (K,) number of points of each class in the training scans of an epoch. The
             check of the scans sets it.
+        present: (M, K) bool, whether the training scans of each of the M datasets have points of
+            each class. The check of the scans sets it.
         stages: the stages of this call in order, from which the time left is estimated; empty if
             they are unknown.
 
@@ -62,6 +64,7 @@ class Plan:
     scores: ScorePair | None = None
     also_read: Sequence[Path | str | None] = ()
     class_counts: np.ndarray | None = None
+    present: np.ndarray | None = None
     stages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -120,7 +123,7 @@ class Plan:
         """
         recipe = sized_by_init(recipe, init)
         dataset, others = open_parts(data, recipe, out, init)
-        recipe = without_weight_averaging(recipe, init, dataset.taxonomy, report)
+        recipe = without_initial_weights(recipe, init, dataset.taxonomy, report)
         scans = join(choose(dataset), others, recipe.training.others)
         return cls(recipe, scans, out, report=report, **settings)
 
@@ -158,12 +161,13 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
     )
 
 
-def without_weight_averaging(
+def without_initial_weights(
     recipe: Recipe, init: Weights | None, classes: Taxonomy, report: Reporter
 ) -> Recipe:
-    """Return the recipe without weight averaging if the initial weights have other classes.
+    """Return the recipe without averages and distillation of initial weights of other classes.
 
-    Their last layers would then be replaced by new ones, which are useless in an average.
+    Their last layers would then be replaced by new ones, which are useless in an average, and
+    teach nothing.
     """
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
@@ -171,9 +175,12 @@ def without_weight_averaging(
     networks = {}
     for name in ("rv", "bev"):
         config = getattr(recipe.training, name)
-        if config.initial:
-            report(f"{name}: no average with the initial weights, which have other classes")
-            networks[name] = dataclasses.replace(config, initial=0.0)
+        if config.initial or config.distill:
+            report(
+                f"{name}: neither an average with the initial weights nor a distillation of them, "
+                "because they have other classes"
+            )
+            networks[name] = dataclasses.replace(config, initial=0.0, distill=0.0)
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
 

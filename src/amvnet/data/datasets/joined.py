@@ -98,10 +98,14 @@ class Joined(Dataset):
         return dataclasses.replace(turn, original=dataset.at_epoch(turn.original, epoch))
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
-        """Read a scan of any of the datasets."""
-        if not isinstance(record, MixedRecord):
-            return self.dataset.read(record, labels)
-        return self.others[record.member - 1].dataset.read(record.original, labels)
+        """Read a scan of any of the datasets; its points have the dataset as their source."""
+        member = 0
+        if isinstance(record, MixedRecord):
+            member = record.member
+            scan = self.others[member - 1].dataset.read(record.original, labels)
+        else:
+            scan = self.dataset.read(record, labels)
+        return dataclasses.replace(scan, source=np.full(len(scan), member))
 
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
         """Read the raw ids of a scan of any dataset; each dataset may have its own ids."""
