@@ -57,7 +57,7 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
     batch, labels = batch_of_two()
     stage = polar_stage()
     with torch.no_grad():
-        voxels = stage.compare(batch, labels)
+        voxels = stage.compare((batch, labels, torch.zeros_like(labels)))
         point_logits = stage.score(batch)
 
     # The voxels of each scan by their logits and labels, in any order.
@@ -86,7 +86,7 @@ def test_pixels_and_voxels_have_the_source_of_their_points(stage: str) -> None:
     batch, labels = batch_of_two()
     made = make_stage(plan_with(CONFIG), stage, build_amvnet(MODEL_CONFIG, 19), None).eval()
     with torch.no_grad():
-        scored = made.compare(batch, labels, batch.scan)
+        scored = made.compare((batch, labels, batch.scan))
     assert scored.source is not None
     assert set(scored.source.tolist()) == {0, 1}
     assert scored.source.tolist() == scored.scan.tolist()
@@ -96,7 +96,7 @@ def test_a_voxel_with_points_of_two_datasets_has_the_first_as_its_source() -> No
     scan = Scan(np.array([[9, 0, 0, 1], [9.01, 0, 0, 1], [30, 0, 0, 1]], np.float32))
     with torch.no_grad():
         scored = polar_stage().compare(
-            PointBatch.of([scan]), torch.tensor([1, 1, 2]), torch.tensor([2, 1, 2])
+            (PointBatch.of([scan]), torch.tensor([1, 1, 2]), torch.tensor([2, 1, 2]))
         )
     assert scored.source is not None
     assert dict(zip(scored.labels.tolist(), scored.source.tolist(), strict=True)) == {1: 1, 2: 2}
@@ -143,8 +143,8 @@ def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(stage
     made.eval()
     source = torch.zeros_like(labels)
     with torch.no_grad():
-        scored = made.compare(batch, labels, source)
-        expected = made.compare(batch, labels, net=teacher).logits
+        scored = made.compare((batch, labels, source))
+        expected = made.compare((batch, labels, source), teacher).logits
         distillation = distillation_loss(scored, expected, made.rivals)
         loss = made.training_step((batch, labels, source), 0)
     assert (scored.logits != expected).any()
@@ -157,7 +157,7 @@ def test_the_loss_over_voxels_learns() -> None:
     optimizer = torch.optim.Adam(stage.trained.parameters(), 0.02)
     losses = []
     for _ in range(16):
-        loss = stage.loss(stage.compare(batch, labels))
+        loss = stage.loss(stage.compare((batch, labels, torch.zeros_like(labels))))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -179,7 +179,7 @@ def test_the_loss_of_a_stage_equals_its_formula_with_all_weights(
 
     batch, labels = batch_of_two()
     with torch.no_grad():
-        scored = made.eval().compare(batch, labels)
+        scored = made.eval().compare((batch, labels, torch.zeros_like(labels)))
         losses = []
         for scan in range(2):
             logits = scored.logits[(scored.scan == scan) & (scored.labels > 0)]

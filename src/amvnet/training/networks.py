@@ -84,19 +84,11 @@ class NetworkStage(Stage):
         self.batches = 0
         self.labelled: Tensor | int = 0
 
-    def compare(
-        self,
-        batch: PointBatch,
-        labels: Tensor,
-        source: Tensor | None = None,
-        net: nn.Module | None = None,
-    ) -> Scored:
+    def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
         """Return the pixels or voxels that the loss compares with their labels.
 
         Args:
-            batch: the P valid points of some scans.
-            labels: (P,) train ids.
-            source: (P,) index of the dataset of each point, or None if it is not needed.
+            batch: the valid points of some scans, their labels and their sources.
             net: the network; by default the trained one.
         """
         raise NotImplementedError
@@ -111,22 +103,20 @@ class NetworkStage(Stage):
         weights = self.class_weights
         return network_loss(scored, weights, self.config.region, region_loss, self.rivals)
 
-    def distillation(
-        self, teacher: nn.Module, batch: PointBatch, labels: Tensor, scored: Scored
-    ) -> Tensor:
+    def distillation(self, teacher: nn.Module, batch: Batch, scored: Scored) -> Tensor:
         """Return the `distillation_loss` of a batch."""
         assert self.rivals is not None
-        teacher.to(batch.points)  # their type and device
+        teacher.to(batch[0].points)  # their type and device
         with torch.no_grad():
-            expected = self.compare(batch, labels, net=teacher)
+            expected = self.compare(batch, teacher)
         return distillation_loss(scored, expected.logits, self.rivals)
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
-        points, labels, source = batch
-        scored = self.compare(points, labels, None if self.rivals is None else source)
+        points, _, _ = batch
+        scored = self.compare(batch)
         loss = self.loss(scored)
         for teacher in self.teachers:
-            loss = loss + self.config.distill * self.distillation(teacher, points, labels, scored)
+            loss = loss + self.config.distill * self.distillation(teacher, batch, scored)
         self.batches += 1
         self.labelled += (scored.labels > 0).any().int()  # a tensor, so that a GPU need not wait
 
@@ -197,14 +187,9 @@ class RangeStage(NetworkStage):
     view: RangeView
     default_region_loss = staticmethod(dice)
 
-    def compare(
-        self,
-        batch: PointBatch,
-        labels: Tensor,
-        source: Tensor | None = None,
-        net: nn.Module | None = None,
-    ) -> Scored:
-        view = self.view.project(batch)
+    def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
+        points, labels, source = batch
+        view = self.view.project(points)
         image = (net or self.trained)(view.image)  # (B, K, H, W)
         pixels = image.permute(0, 2, 3, 1).flatten(0, 2)  # (B * H * W, K)
 
@@ -214,9 +199,9 @@ class RangeStage(NetworkStage):
         return Scored(
             logits=pixels.index_select(0, index),
             labels=labels[shown],
-            scan=index // (len(pixels) // batch.count),
-            scans=batch.count,
-            source=None if source is None else source[shown],
+            scan=index // (len(pixels) // points.count),
+            scans=points.count,
+            source=source[shown],
         )
 
     def score(self, batch: PointBatch) -> Tensor:
@@ -231,14 +216,9 @@ class PolarStage(NetworkStage):
     view: PolarView
     default_region_loss = staticmethod(lovasz_softmax)
 
-    def compare(
-        self,
-        batch: PointBatch,
-        labels: Tensor,
-        source: Tensor | None = None,
-        net: nn.Module | None = None,
-    ) -> Scored:
-        view = self.view.project(batch)
+    def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
+        points, labels, source = batch
+        view = self.view.project(points)
         return _score_voxels(view, (net or self.trained)(view), labels, source)
 
     def score(self, batch: PointBatch) -> Tensor:
@@ -246,7 +226,7 @@ class PolarStage(NetworkStage):
         return view.to_points(self.trained(view))
 
 
-def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tensor | None) -> Scored:
+def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tensor) -> Scored:
     """Return the voxels that have points, each with the most frequent label of its points.
 
     A voxel with points of several datasets has the first of them as its source.
@@ -255,7 +235,7 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tenso
         view: the grids of B scans.
         scores: (M, Z * K) logits of the M pillars that have points.
         labels: (P,) train ids.
-        source: (P,) index of the dataset of each point, or None.
+        source: (P,) index of the dataset of each point.
     """
     scans, radial, angular, vertical = view.shape
     logits = scores.unflatten(1, (vertical, -1)).flatten(0, 1)  # (M * Z, K)
@@ -265,11 +245,11 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tenso
     voxel_labels = majority_labels(cells, labels, count=len(voxels), classes=classes)
 
     scan = view.occupied[voxels // vertical] // (radial * angular)
-    if source is not None:
-        source = source.new_zeros(len(voxels)).scatter_reduce_(
-            0, cells, source, "amin", include_self=False
-        )
-    return Scored(logits=voxel_logits, labels=voxel_labels, scan=scan, scans=scans, source=source)
+    voxel_source = source.new_zeros(len(voxels))
+    voxel_source.scatter_reduce_(0, cells, source, "amin", include_self=False)
+    return Scored(
+        logits=voxel_logits, labels=voxel_labels, scan=scan, scans=scans, source=voxel_source
+    )
 
 
 def train_network(plan: Plan, name: str, weights: Weights) -> None:
