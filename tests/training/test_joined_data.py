@@ -13,6 +13,7 @@ import yaml
 
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import AugmentConfig
+from amvnet.data.datasets import simulated
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.joined import MixedRecord, join
 from amvnet.data.datasets.open import open_dataset
@@ -44,6 +45,7 @@ from fixtures.tiny import (
     BUILDING,
     CAR,
     GOLDEN,
+    fake_drive,
     fresh_weights,
     make_streets,
     write_recipe,
@@ -129,12 +131,38 @@ def test_the_check_finds_the_classes_that_only_other_datasets_have(tmp_path: Pat
         tmp_path / "run",
         report=lines.append,
     )
-    _, present = check_data(plan)
+    _, rivals = check_data(plan)
+    assert rivals is not None
     car = SEMANTICKITTI.classes.index("car")
-    assert present[:, car].tolist() == [False, True]
-    assert present[0].sum() == present[1].sum() - 1
+    assert np.argwhere(~rivals).tolist() == [[0, car]]
     (line,) = [line for line in lines if "other --data" in line]
     assert line.startswith(f"train: car: learnt from the other --data alone; the scans of {a.spec}")
+
+
+def test_streets_are_not_taken_to_lack_the_classes_of_later_epochs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the streets of the first epoch are checked."""
+    monkeypatch.setattr(simulated, "drive_street", fake_drive)
+    monkeypatch.setattr(simulated, "SCANS", 2)
+    make_streets(tmp_path / "a", ("00",), 4)
+    pole = 80
+    for path in (tmp_path / "a").rglob("*.label"):
+        raw = np.fromfile(path, np.uint32)
+        raw[:5] = pole  # the streets have no pole
+        raw.tofile(path)
+    a = open_dataset(str(tmp_path / "a"))
+    streets = open_dataset(f"simulated-hdl64e:{tmp_path / 'streets'}")
+    others = [TrainingScans(streets, streets.records(["0", "1"]), [])]
+    plan = Plan(
+        load_recipe("semantickitti-compact"),
+        join(TrainingScans(a, a.records(["00"]), []), others, 0.5),
+        tmp_path / "run",
+    )
+    _, rivals = check_data(plan)
+    assert rivals is not None
+    assert rivals[1].all()
+    assert rivals[0, SEMANTICKITTI.classes.index("pole")]
 
 
 def test_scans_that_are_mixed_into_others_are_of_the_same_epoch(

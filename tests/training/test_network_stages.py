@@ -32,11 +32,12 @@ CONFIG = NetworkTraining(epochs=1, batch=2, lr=1e-3)
 MODEL_CONFIG = from_dict(ModelConfig, MODEL)
 
 
-def plan_with(config: NetworkTraining) -> Plan:
+def plan_with(config: NetworkTraining, rivals: np.ndarray | None = None) -> Plan:
     """Return a plan without scans, in which both networks are trained alike."""
     training = replace(TrainingConfig(), rv=config, bev=config)
     dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
-    return Plan(Recipe(training=training), TrainingScans(dataset, [], []), Path("run"))
+    scans = TrainingScans(dataset, [], [])
+    return Plan(Recipe(training=training), scans, Path("run"), rivals=rivals)
 
 
 def polar_stage() -> PolarStage:
@@ -107,7 +108,7 @@ def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> No
     present = np.ones((2, 19), bool)
     present[0, 4] = False
     model = build_amvnet(MODEL_CONFIG, 19)
-    made: Any = make_stage(plan_with(CONFIG), stage, model, None, rival_classes(present)).eval()
+    made: Any = make_stage(plan_with(CONFIG, rival_classes(present)), stage, model, None).eval()
     made.log = lambda *_, **__: None
     made.step_factor = lambda *_: 1.0
     batch, labels = batch_of_two()
@@ -130,7 +131,7 @@ def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(stage
     assert not make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), None).teachers
     present[0, 4] = False
     rivals = rival_classes(present)
-    made: Any = make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), None, rivals)
+    made: Any = make_stage(plan_with(config, rivals), stage, build_amvnet(MODEL_CONFIG, 19), None)
     made.log = lambda *_, **__: None
     made.step_factor = lambda *_: 1.0
     (teacher,) = made.teachers

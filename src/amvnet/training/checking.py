@@ -20,12 +20,12 @@ from amvnet.training.run_folder import COUNTS
 SHOWN_SCANS = 3  # largest number of broken scans that a message names
 
 
-def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray | None]:
     """Check all labels of the scans of a training, and report what may be a mistake.
 
     Returns:
         (K,) int64, the number of points of each class in the training scans of an epoch; and
-        (M, K) bool, whether the training scans of each of M datasets have points of each class.
+        the `rival_classes` of the datasets.
 
     Raises:
         InputError: if a label has an unknown id, a scan cannot be read, or there is nothing to
@@ -48,7 +48,9 @@ def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
             plan.report(line)
         totals += checked.count_points(counted_records)
         specs.append(checked.spec)
-        present.append(checked.splits["train"].points[1:] > 0)
+        # Only the streets of the first epoch are checked; later ones have other classes.
+        is_simulated = isinstance(dataset, SimulatedStreets)
+        present.append((checked.splits["train"].points[1:] > 0) | is_simulated)
 
     classes = plan.scans.dataset.taxonomy.classes
     rivals = rival_classes(np.array(present))
@@ -60,7 +62,7 @@ def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
                     f"train: {', '.join(absent)}: learnt from the other --data alone; the scans of "
                     f"{spec} have no such point, so they do not count against these classes"
                 )
-    return totals[1:], np.array(present)
+    return totals[1:], rivals
 
 
 def keep_counts(plan: Plan, counts: np.ndarray) -> None:

@@ -29,7 +29,6 @@ from amvnet.training.losses import (
     lovasz_softmax,
     majority_labels,
     network_loss,
-    rival_classes,
 )
 from amvnet.training.muon import Muon
 from amvnet.training.plan import Plan
@@ -280,8 +279,7 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     if config.class_weights:
         assert plan.class_counts is not None
         loss_weights = class_weights(plan.class_counts)
-    rivals = None if plan.present is None else rival_classes(plan.present)
-    stage = make_stage(plan, name, model, loss_weights, rivals)
+    stage = make_stage(plan, name, model, loss_weights)
     if stage.teachers:
         plan.report(f"{name}: keeps what --init knows of classes that a dataset lacks (distill)")
     try:
@@ -294,31 +292,28 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
 
 
 def make_stage(
-    plan: Plan,
-    name: str,
-    model: AMVNet,
-    weights: np.ndarray | None,
-    rivals: np.ndarray | None = None,
+    plan: Plan, name: str, model: AMVNet, weights: np.ndarray | None
 ) -> RangeStage | PolarStage:
     """Return the stage `rv` or `bev` of a model.
 
     Args:
         weights: (K,) class weights of the loss, or None for equal weights.
-        rivals: (M, K) bool, which classes the points of each dataset count against; None for all.
     """
     config = getattr(plan.recipe.training, name)
     shared: dict[str, Any] = {
         "config": config,
         "taxonomy": plan.scans.dataset.taxonomy,
+        "weights": weights,
+        "rivals": plan.rivals,
         "processes": plan.processes,
         "report": plan.report,
     }
     net = model.range_net if name == "rv" else model.polar_net
-    distils = config.distill and rivals is not None
-    shared |= {"rivals": rivals, "teacher": copy.deepcopy(net) if distils else None}
+    if config.distill and plan.rivals is not None:
+        shared["teacher"] = copy.deepcopy(net)
     if name == "rv":
-        return RangeStage(model.range_view, net, weights, **shared)
-    return PolarStage(model.polar_view, net, weights, **shared)
+        return RangeStage(model.range_view, net, **shared)
+    return PolarStage(model.polar_view, net, **shared)
 
 
 def make_loaders(

@@ -44,8 +44,8 @@ class Plan:
             ignored.
         class_counts: (K,) number of points of each class in the training scans of an epoch. The
             check of the scans sets it.
-        present: (M, K) bool, whether the training scans of each of the M datasets have points of
-            each class. The check of the scans sets it.
+        rivals: (M, K) bool, which classes the points of each of the M datasets count against
+            (`rival_classes`), or None for all. The check of the scans sets it.
         stages: the stages of this call in order, from which the time left is estimated; empty if
             they are unknown.
 
@@ -64,7 +64,7 @@ class Plan:
     scores: ScorePair | None = None
     also_read: Sequence[Path | str | None] = ()
     class_counts: np.ndarray | None = None
-    present: np.ndarray | None = None
+    rivals: np.ndarray | None = None
     stages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -61,8 +61,8 @@ def train(
     weights = _first_weights(plan, init, names)
     for name in names:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
-    counts, present = check_data(plan)
-    plan = dataclasses.replace(plan, class_counts=counts, present=present)
+    counts, rivals = check_data(plan)
+    plan = dataclasses.replace(plan, class_counts=counts, rivals=rivals)
     plan.processes.wait()
     if plan.processes.first:
         write_record(plan, stage, init)
