@@ -13,7 +13,7 @@ import yaml
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
-from amvnet.data.datasets.select import split_records, training_records
+from amvnet.data.datasets.select import all_to_train, split_records
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
@@ -219,7 +219,7 @@ def test_test_scans_are_never_trained_on(tmp_path: Path) -> None:
     for with_val in (False, True):
         scans = split_records(data, None, None, with_val)
         assert "b" not in {record.sequence for record in scans.train}
-    assert "b" not in {record.sequence for record in training_records(data)}
+    assert "b" not in {record.sequence for record in all_to_train(data).train}
 
 
 def test_the_default_split_validates_with_the_last_sequence_that_has_labels(

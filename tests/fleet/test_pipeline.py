@@ -99,7 +99,7 @@ def test_a_fleet_has_the_labels_of_predict_and_a_later_run_does_only_what_is_lef
     assert code == 3
     broken, summary = error.splitlines()
     assert broken.startswith("amvnet: s3://fleet/scans/drive9/000002.bin: expected")
-    assert "23 of 24 scans segmented, 1 broken" in summary
+    assert "23 of 24 scans are labelled, 1 cannot be used" in summary
     after = {row["scan"]: row for row in table(bucket, "out").to_pylist()}
     assert {name for name in before if after[name] != before[name]} == {"drive1/000003"}
 
@@ -132,7 +132,7 @@ def test_a_manifest_with_odd_rows_labels_the_others(
     code, error = run_cli(*command(fleet, str(out), inputs=str(manifest)))
     assert code == 3
     assert len(error.splitlines()) == 1 + len(odd)
-    assert "4 of 7 scans segmented, 3 broken" in error
+    assert "4 of 7 scans are labelled, 3 cannot be used" in error
     for path in paths:
         expected = labels[f"drive2/{path.stem}.label"]
         assert (out / f"good/{path.stem}.label").read_bytes() == expected
@@ -154,7 +154,7 @@ def test_a_label_that_is_gone_at_the_end_is_not_counted(
     code, error = run_cli(*words)
     assert code == 3
     assert "000001.bin: expected its labels" in error
-    assert "3 of 4 scans segmented, 1 broken" in error
+    assert "3 of 4 scans are labelled, 1 cannot be used" in error
 
 
 @pytest.mark.parametrize("what", ["worker", "driver"])
@@ -284,7 +284,7 @@ def test_an_output_folder_that_cannot_be_used_is_one_line(
     for text, words in (
         (f"{weights} --out s3://none/x", ("s3://none/x", "credentials")),
         (f"{weights} --out {out}", ("--resume",)),
-        (f"--weights {other} --out {out} --resume", ("another weights;",)),
+        (f"--weights {other} --out {out} --resume", ("other values of weights;",)),
     ):
         line = refusal(f"fleet s3://fleet/scans {text}")
         for word in words:
@@ -405,7 +405,7 @@ def test_a_scan_that_ends_its_workers_is_a_broken_one(
     errors = {row["scan"]: row["error"] for row in rows}
     assert len(rows) == len(errors) == 5
     assert [name for name, error in errors.items() if error] == ["poison"]
-    with pytest.raises(SomeBroken, match="4 of 5 scans segmented, 1 broken") as caught:
+    with pytest.raises(SomeBroken, match="4 of 5 scans are labelled, 1 cannot be used") as caught:
         run.finish()
     assert "ends its reader" in caught.value.faults[0]
 

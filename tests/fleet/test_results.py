@@ -134,10 +134,10 @@ def test_another_runs_folder_is_refused_in_one_line(out: Place) -> None:
     Results(out, REQUEST)
     fails(lambda: Results(out, REQUEST), out.url, "--resume")
     other = replace(REQUEST, weights=fresh_weights(seed=1))
-    fails(lambda: Results(out, other, resume=True), out.url, "another weights;")
+    fails(lambda: Results(out, other, resume=True), out.url, "other values of weights;")
     for content in (b"[1", b"[]", b"1" * 10_000, b"[" * 100_000, b"\xff", b""):
         (out / "results/run.json").write(content)
-        fails(lambda: Results(out, REQUEST, resume=True), "another weights,")
+        fails(lambda: Results(out, REQUEST, resume=True), "other values of weights,")
 
 
 def test_a_folder_with_other_files_is_refused(out: Place) -> None:

@@ -164,7 +164,7 @@ def test_one_doubtful_recording_is_one_line() -> None:
 def test_many_doubtful_recordings_are_few_lines() -> None:
     lines = said([entry(str(index), 0.9) for index in range(50)])
     assert len(lines) == 12
-    assert "40 more" in lines[-1]
+    assert "40 other recordings" in lines[-1]
 
 
 def test_recordings_of_a_run_are_judged_on_the_command_line(

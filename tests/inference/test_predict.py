@@ -260,7 +260,7 @@ def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_p
     check_same(out, whole)
 
     (out / JOURNAL).rename(out / UNFINISHED)
-    assert "another method;" in refusal(predict(world, out, "--resume --method rv"))
+    assert "other values of method;" in refusal(predict(world, out, "--resume --method rv"))
 
     succeed(predict(world, out, "--method rv --overwrite"))
     assert files(out) == files(whole)
@@ -410,7 +410,7 @@ def test_the_folder_of_another_run_is_named_in_a_warning(
     assert "earlier run" not in capsys.readouterr().out
 
     succeed(f"predict {world}/scans/000001.bin {command}")
-    warning = "the labels of 1 scan of an earlier run, made with another method; give each run"
+    warning = "the labels of 1 scan of an earlier run, made with other values of method; give"
     assert warning in capsys.readouterr().out
 
 
@@ -641,7 +641,7 @@ def test_scans_that_vanish_during_a_run_are_listed_and_the_others_are_done(
     code, error = run_cli(*command.split())
     assert code == 3
     *faults, last = error.splitlines()
-    assert "2 of 4 scans segmented, 2 broken" in last
+    assert "2 of 4 scans are labelled, 2 cannot be used" in last
     for name, fault in zip(("000000", "000002"), faults, strict=True):
         assert f"{folder / name}.bin: expected" in fault
     labels = sorted(path.stem for path in (tmp_path / "out").rglob("*.label"))

@@ -32,12 +32,12 @@ CONFIG = NetworkTraining(epochs=1, batch=2, lr=1e-3)
 MODEL_CONFIG = from_dict(ModelConfig, MODEL)
 
 
-def plan_with(config: NetworkTraining, rivals: np.ndarray | None = None) -> Plan:
+def plan_with(config: NetworkTraining, taught: np.ndarray | None = None) -> Plan:
     """Return a plan without scans, in which both networks are trained alike."""
     training = replace(TrainingConfig(), rv=config, bev=config)
     dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
     scans = TrainingScans(dataset, [], [])
-    return Plan(Recipe(training=training), scans, Path("run"), rivals=rivals)
+    return Plan(Recipe(training=training), scans, Path("run"), taught=taught)
 
 
 def polar_stage() -> PolarStage:
@@ -127,11 +127,10 @@ def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> No
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(stage: str) -> None:
     config = replace(CONFIG, distill=2.0)
-    present = np.ones((2, 19), bool)
+    taught = np.ones((2, 19), bool)
     assert not make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), None).teachers
-    present[0, 4] = False
-    rivals = rival_classes(present)
-    made: Any = make_stage(plan_with(config, rivals), stage, build_amvnet(MODEL_CONFIG, 19), None)
+    taught[0, 4] = False
+    made: Any = make_stage(plan_with(config, taught), stage, build_amvnet(MODEL_CONFIG, 19), None)
     made.log = lambda *_, **__: None
     made.step_factor = lambda *_: 1.0
     (teacher,) = made.teachers

@@ -6,15 +6,21 @@ from pathlib import Path
 
 import yaml
 
+from amvnet.config.schema import Recipe
+from amvnet.data.datasets.own import open_own
+from amvnet.data.datasets.select import TrainingScans
+from amvnet.training.plan import Plan
 from amvnet.training.run_folder import (
     LAST,
     MAX_CHANGES,
     SETTINGS,
     check_begun,
     describe_changes,
+    stage_settings,
 )
 
 from fixtures.commands import fails
+from fixtures.tiny import fresh_weights
 
 EARLIER = {
     "model": {"range_net": {"widths": [8, 16], "gru": True}},
@@ -39,6 +45,18 @@ def test_changes_have_both_values_but_no_digests() -> None:
         "training.rv.ema 0.9 instead of None",
         "other scans to train on",
     ]
+
+
+def test_settings_tell_classes_apart_by_names_order_and_ids(tmp_path: Path) -> None:
+    found: set[str] = set()
+    (tmp_path / "a.bin").write_bytes(bytes(160))
+    for classes in ({"a": 1, "b": 2}, {"b": 2, "a": 1}, {"a": 2, "b": 1}, {"a": 1, "c": 2}):
+        path = tmp_path / f"{len(found)}.yaml"
+        path.write_text(yaml.safe_dump({"classes": classes, "scans": "*.bin"}, sort_keys=False))
+        scans = TrainingScans(open_own(path), [], [])
+        settings = stage_settings(Plan(Recipe(), scans, tmp_path / "run"), "rv", fresh_weights())
+        found.add(settings["classes"])
+    assert len(found) == 4
 
 
 def test_a_refused_resume_says_which_values_differ(tmp_path: Path) -> None:

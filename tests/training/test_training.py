@@ -49,6 +49,7 @@ from fixtures.tiny import (
     fake_drive,
     fresh_weights,
     make_streets,
+    without,
     write_recipe,
 )
 
@@ -331,6 +332,28 @@ def test_a_share_of_the_initial_weights_is_kept_and_resumes_to_the_bit(
     whole = train(world, tmp_path / "whole", *averaged)
     train_interrupted("bev", 1, world, tmp_path / "cut", *averaged)
     assert not differing(train(world, tmp_path / "cut", *averaged, "--resume"), whole)
+
+
+def test_a_part_that_the_initial_weights_lack_is_missed_before_the_first_stage(
+    world: Path, tmp_path: Path
+) -> None:
+    save(without(fresh_weights(), "polar_net"), tmp_path / "rv.safetensors")
+    code, error = run_cli(
+        *("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run"),
+        *("--init", tmp_path / "rv.safetensors", "--training.bev.initial", 0.5),
+    )
+    assert code == 2
+    assert "polar_net to begin with, found range_net, point_head in --init" in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_not_resumed_from_other_initial_weights(world: Path, tmp_path: Path) -> None:
+    command = [*train_arguments(world, tmp_path / "run"), "--stage", "rv", "--init"]
+    for seed in (1, 2):
+        save(fresh_weights(seed=seed), tmp_path / f"{seed}.safetensors")
+    assert run_cli(*command, tmp_path / "1.safetensors")[0] == 0
+    assert "other weights to begin with" in fail(*command, tmp_path / "2.safetensors", "--resume")
+    assert run_cli(*command, tmp_path / "1.safetensors", "--resume")[0] == 0
 
 
 @pytest.mark.parametrize("option", ["initial", "distill"])

@@ -115,9 +115,7 @@ class TrainingChoice:
         from amvnet.data.datasets.select import split_records
 
         scans = split_records(dataset, self.train_sequences, self.val_sequences, with_val)
-        if scans.unlabelled:
-            report(f"skipped for lack of labels: {describe_records(scans.unlabelled)}")
-        _report_unnamed(scans)
+        report_unused(scans)
         return scans
 
     def splits(self, dataset: Dataset) -> Iterator[tuple[str, Sequence[ScanRecord]]]:
@@ -138,7 +136,18 @@ class TrainingChoice:
             yield "test", dataset.labelled(dataset.records(dataset.official("test")))
 
 
-def _report_unnamed(scans: TrainingScans) -> None:
+def report_unused(scans: TrainingScans, title: str = "") -> None:
+    """Report the scans of a dataset that a training does not use.
+
+    Args:
+        title: the beginning of each line.
+    """
+    if scans.unlabelled:
+        report(f"{title}skipped for lack of labels: {describe_records(scans.unlabelled)}")
+    _report_unnamed(scans, title)
+
+
+def _report_unnamed(scans: TrainingScans, title: str = "") -> None:
     """Report the scans of a user's dataset that its split does not name."""
     from amvnet.data.datasets.own import OwnScans
 
@@ -147,7 +156,7 @@ def _report_unnamed(scans: TrainingScans) -> None:
         unnamed = [record for record in scans.dataset.left_out() if record.name not in used]
         if unnamed:
             text = describe_records(unnamed)
-            report(f"not used, because the split does not name them: {text}")
+            report(f"{title}not used, because the split does not name them: {text}")
 
 
 @dataclass(frozen=True)

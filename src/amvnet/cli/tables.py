@@ -106,7 +106,7 @@ def timing_table(report: Mapping[str, Any]) -> Table:
         f"{report['uncertain'] / points:.1%} of them uncertain"
     )
     table = Table(title=title, show_edge=False)
-    for name in ("stage", "ms", "half of the runs", "share"):
+    for name in ("stage", "ms", "quartiles", "share"):
         table.add_column(name, justify="left" if name == "stage" else "right")
 
     stages = report["stages_ms"]
@@ -166,7 +166,7 @@ def recipes_table() -> Table:
         image = recipe.model.range_view
         table.add_row(
             name,
-            "of --init" if recipe.from_init else recipe.taxonomy,
+            "of --data" if recipe.from_init else recipe.taxonomy,
             ", ".join(epochs),
             "of --init" if recipe.from_init else f"{image.height} x {image.width}",
         )

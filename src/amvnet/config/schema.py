@@ -320,8 +320,8 @@ class NetworkTraining(Checked):
     initial: Share = 0.0
     """Share of the initial weights of `--init` in the result, which is a mean (open)."""
     distill: Factor = 0.0
-    """Weight of the distillation (not in the paper). If one of several datasets lacks a class, it
-    keeps the probabilities that the network of `--init` gives the class there."""
+    """Weight of the distillation (not in the paper). On scans of a dataset that lacks a class which
+    another dataset has, it keeps the probabilities of the class near those of `--init`."""
     accumulate: Scans = 1
     """Number of parts into which each process splits a batch that does not fit into memory."""
 
@@ -412,7 +412,7 @@ class Recipe:
     sensor: str = "hdl64e"
     """Name of the scans' sensor, for the weights file."""
     from_init: bool = False
-    """Take the classes, the sensor and the sizes of the model from the weights of --init."""
+    """Take the sensor and the sizes of the model from the weights of --init."""
     stages: tuple[StageName, ...] = ("rv", "bev", "head")
     """The stages to train by default. A baseline trains only one network."""
     model: ModelConfig = ModelConfig()

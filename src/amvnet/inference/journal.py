@@ -133,7 +133,7 @@ def describe_other_run(folder: Path, settings: Mapping[str, Any], scans: Set[str
 
     text = f"{folder} has the labels of {counted(len(others), 'scan')} of an earlier run"
     if changed:
-        text += f", made with another {', '.join(sorted(changed))}"
+        text += f", made with other values of {', '.join(sorted(changed))}"
     return f"{text}; give each run a folder of its own"
 
 
@@ -151,7 +151,7 @@ def check_settings(
     changed = [key for key in settings if settings[key] != earlier.get(key)]
     if changed:
         raise InputError(
-            f"{place}: expected the settings of the earlier run, found another "
+            f"{place}: expected the settings of the earlier run, found other values of "
             f"{', '.join(changed)}; resume it with the same settings, or {advice}"
         )
 

@@ -32,7 +32,7 @@ from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import READ_AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
 from amvnet.outputs import Signature, check_not_read, check_outputs
-from amvnet.progress import Progress, no_progress
+from amvnet.progress import Progress, counted, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED_SCANS
 
@@ -299,11 +299,11 @@ def check_faults(faults: Sequence[str], total: int) -> None:
     """
     if faults and len(faults) == total:
         others = len(faults) - 1
-        more = f" (and {others} more scans, each broken)" if others else ""
+        more = f" (and {counted(others, 'other scan')} that cannot be used)" if others else ""
         raise InputError(faults[0] + more)
     if faults:
         raise SomeBroken(
-            f"{total - len(faults)} of {total} scans segmented, {len(faults)} broken",
+            f"{total - len(faults)} of {total} scans are labelled, {len(faults)} cannot be used",
             list(faults),
         )
 

@@ -16,7 +16,7 @@ from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS
-from amvnet.progress import Progress, Reporter, no_progress, report_nothing
+from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
 from amvnet.scan import Scan
 
 SHOWN_RECORDINGS = 10  # the most doubtful recordings that are named, each in a line
@@ -154,5 +154,5 @@ def report_certainty(entries: Sequence[Entry], usual: float | None, report: Repo
     for sensor in list(doubtful)[:SHOWN_RECORDINGS]:
         report(f"warning: {sensor}: {doubtful[sensor]}")
     others = len(doubtful) - SHOWN_RECORDINGS
-    more = f"as in {others} more; " if others > 0 else ""
+    more = f"the same holds for {counted(others, 'other recording')}; " if others > 0 else ""
     report(f"warning: {more}{ADVICE}")

@@ -41,6 +41,7 @@ SIMULATED_QUANTILES = {
 MAX_INTENSITY = 1e9  # limit of a quantile in a file; no device writes larger intensities
 QUANTILES_KEY = "intensity_quantiles"  # key of the quantiles in a part's training record
 MATCHED_KEY = "match_intensity"  # key of `TrainedIntensity.is_matched` in a part's training record
+OPTIONAL_KEY = "optional_intensity"  # key of `TrainedIntensity.is_optional` in the same record
 NO_INTENSITY = [0.0] * len(PROBABILITIES)  # the quantiles of training scans without intensities
 
 
@@ -98,7 +99,7 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
         InputError: if a record has wrong quantiles.
     """
     quantiles: Sequence[float] | None = SIMULATED_QUANTILES.get(sensor)
-    shares = []
+    optional = []
     matched = []
     for part, record in network_records(training):
         carried = record.get(QUANTILES_KEY)
@@ -107,18 +108,27 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
         elif carried:
             quantiles = check_quantiles(carried, f"the training record of {part}")
 
-        augment = record.get("augment")
-        share = augment.get("no_intensity") if isinstance(augment, Mapping) else None
-        shares.append(share if isinstance(share, (int, float)) else 0)
+        optional.append(_is_optional(record))
         matched.append(record.get(MATCHED_KEY) is True)
 
     if quantiles is None:
         return None
     return TrainedIntensity(
         quantiles,
-        is_optional=min(shares, default=0) >= BLIND_SHARE,
+        is_optional=bool(optional) and all(optional),
         is_matched=bool(matched) and all(matched),
     )
+
+
+def _is_optional(record: Mapping[str, Any]) -> bool:
+    """Return whether the training of a record taught a network to do without intensities."""
+    if isinstance(record.get(OPTIONAL_KEY), bool):
+        return bool(record[OPTIONAL_KEY])
+
+    # Records of earlier versions have only the share of scans without intensities.
+    augment = record.get("augment")
+    share = augment.get("no_intensity") if isinstance(augment, Mapping) else None
+    return isinstance(share, (int, float)) and share >= BLIND_SHARE
 
 
 def adapt_intensity(scan: Scan, trained: TrainedIntensity | None) -> Scan:

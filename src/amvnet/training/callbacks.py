@@ -115,13 +115,19 @@ class KeepWeights(Callback):
             sensor = sensor_record(plan.scans.dataset, plan.scans.train, intensity)
             self.record = stage_record(plan, self.settings, sensor)
         self.started = time.monotonic()  # unlike the system's clock, it is never set back
+        self.seconds_before = 0.0  # the time of earlier calls, of which this one continues the last
         self.highest = -1.0  # mIoU of the best weights so far, in [0, 1]
 
     def state_dict(self) -> dict[str, Any]:
-        return {"highest": self.highest}
+        return {"highest": self.highest, "seconds": self._seconds()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.highest = state_dict["highest"]
+        self.seconds_before = state_dict["seconds"]
+
+    def _seconds(self) -> float:
+        """Return how long the training has taken, without the time between its calls."""
+        return self.seconds_before + time.monotonic() - self.started
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         pl_module.check_epoch()
@@ -148,11 +154,10 @@ class KeepWeights(Callback):
 
     def _trained(self, state: dict[str, Tensor], metrics: dict[str, float]) -> Weights:
         """Return weights that hold only the trained part, given its parameters."""
-        seconds = round(time.monotonic() - self.started)
         return dataclasses.replace(
             self.weights,
             tensors=part_state(self.part, state),
-            training={self.part: {**self.record, "seconds": seconds}},
+            training={self.part: {**self.record, "seconds": round(self._seconds())}},
             metrics={self.part: metrics},
         )
 

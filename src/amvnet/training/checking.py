@@ -12,57 +12,56 @@ from amvnet.data.datasets.joined import Joined, MixedRecord
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.progress import Tenths, counted
-from amvnet.training.losses import rival_classes
+from amvnet.progress import Progress, Tenths, counted
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import COUNTS
 
 SHOWN_SCANS = 3  # largest number of broken scans that a message names
+# A dataset teaches a class if more than this share of its labelled points have it. A few points may
+# have it by mistake.
+STRAY_SHARE = 1e-5
 
 
-def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray | None]:
+def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """Check all labels of the scans of a training, and report what may be a mistake.
+
+    Of simulated streets, only those of the first epoch are checked.
 
     Returns:
         (K,) int64, the number of points of each class in the training scans of an epoch; and
-        the `rival_classes` of the datasets.
+        (M, K) bool, whether each of the M datasets teaches each class, as `rival_classes` takes it.
 
     Raises:
         InputError: if a label has an unknown id, a scan cannot be read, or there is nothing to
             learn or to validate with.
     """
+    totals = np.zeros(plan.scans.dataset.taxonomy.size + 1, dtype=np.int64)
+    taught = []
+    for dataset, splits, counted_records in _datasets_of(plan):
+        checked = check_scans(dataset, splits, _progress(plan), plan.processes)
+        _refuse(checked)
+        totals += checked.count_points(counted_records)
+        if isinstance(dataset, SimulatedStreets):  # the streets of later epochs have other classes
+            taught.append(np.ones(len(totals) - 1, dtype=bool))
+            continue
+
+        for line in checked.warnings():
+            plan.report(f"{checked.spec}: {line}")
+        points = checked.splits["train"].points[1:]
+        taught.append(points > STRAY_SHARE * points.sum())
+    return totals[1:], np.array(taught)
+
+
+def _progress(plan: Plan) -> Progress:
+    """Return a function that reports tenths of the scans of a dataset as checked."""
     tenths = Tenths()
+    size = plan.processes.size
 
     def progress(done: int, total: int) -> None:
         if tenths.ends(done, total):
-            size = plan.processes.size
             plan.report(f"checked {min(done * size, total * size)} of {total * size} scans")
 
-    specs = []
-    present = []
-    totals = np.zeros(plan.scans.dataset.taxonomy.size + 1, dtype=np.int64)
-    for dataset, splits, counted_records in _datasets_of(plan):
-        checked = check_scans(dataset, splits, progress, plan.processes)
-        _refuse(checked)
-        for line in checked.warnings():
-            plan.report(line)
-        totals += checked.count_points(counted_records)
-        specs.append(checked.spec)
-        # Only the streets of the first epoch are checked; later ones have other classes.
-        is_simulated = isinstance(dataset, SimulatedStreets)
-        present.append((checked.splits["train"].points[1:] > 0) | is_simulated)
-
-    classes = plan.scans.dataset.taxonomy.classes
-    rivals = rival_classes(np.array(present))
-    if rivals is not None:
-        for spec, row in zip(specs, rivals, strict=True):
-            absent = [classes[index] for index in np.flatnonzero(~row)]
-            if absent:
-                plan.report(
-                    f"train: {', '.join(absent)}: learnt from the other --data alone; the scans of "
-                    f"{spec} have no such point, so they do not count against these classes"
-                )
-    return totals[1:], rivals
+    return progress
 
 
 def keep_counts(plan: Plan, counts: np.ndarray) -> None:

@@ -95,7 +95,7 @@ class ScanSet(data.Dataset[Scan]):
             scan = mix(scan, self._draw_other(epoch, rng), rng)
         if config.laser_mix and rng.random() < config.laser_mix:
             scan = mix_lasers(scan, self._draw_other(epoch, rng), rng)
-        if config.paste and rng.random() < config.paste:
+        if self.pasted and config.paste and rng.random() < config.paste:
             scan = paste(scan, self._draw_other(epoch, rng), self.pasted, rng)
         return scan
 

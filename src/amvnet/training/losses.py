@@ -42,20 +42,21 @@ def class_weights(counts: NDArray[np.number]) -> NDArray[np.float32]:
     return scaled
 
 
-def rival_classes(present: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+def rival_classes(taught: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     """Return which classes the points of each dataset count against.
 
-    A dataset without a point of a class cannot teach what does not belong to the class. If another
-    dataset has the class, the points of the first do not count against it: otherwise, the networks
-    would learn that the class never occurs with the first dataset's sensor.
+    A dataset without points of a class cannot teach what does not belong to the class. If another
+    dataset teaches the class, the points of the first do not count against it: otherwise, the
+    networks would learn that the class never occurs with the first dataset's sensor. All points
+    count against a class that no dataset teaches.
 
     Args:
-        present: (M, K) whether each of M datasets has points of each class.
+        taught: (M, K) whether each of M datasets has enough points of each class to teach it.
 
     Returns:
         (M, K) bool, or None if all points count against all classes.
     """
-    rivals = present | ~present.any(axis=0)
+    rivals = taught | ~taught.any(axis=0)
     return None if rivals.all() else rivals
 
 
@@ -180,8 +181,10 @@ def distillation_loss(scored: Scored, teacher: Tensor, rivals: Tensor) -> Tensor
     others = competes.index_select(0, index)  # (N, K) bool, the classes that are not left out
     scan = scored.scan.index_select(0, index)
 
-    log = scored.logits.index_select(0, index).float().log_softmax(dim=1)
-    target = teacher.index_select(0, index).float().softmax(dim=1)
+    logits = scored.logits.index_select(0, index)
+    precision = torch.promote_types(logits.dtype, torch.float32)
+    log = logits.to(precision).log_softmax(dim=1)
+    target = teacher.index_select(0, index).to(precision).softmax(dim=1)
     log_of_others = log.masked_fill(~others, -torch.inf).logsumexp(dim=1)
     losses = -(target * log).masked_fill(others, 0).sum(dim=1)
     losses = losses - target.masked_fill(~others, 0).sum(dim=1) * log_of_others

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import NetworkTraining
+from amvnet.data.datasets.joined import Joined
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
@@ -29,10 +31,10 @@ from amvnet.training.losses import (
     lovasz_softmax,
     majority_labels,
     network_loss,
+    rival_classes,
 )
 from amvnet.training.muon import Muon
-from amvnet.training.plan import Plan
-from amvnet.training.run_folder import PART_OF
+from amvnet.training.plan import Plan, learnt_intensity
 from amvnet.training.stage import Loaders, Stage, fit
 from amvnet.weights.file import Weights
 
@@ -264,15 +266,8 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
             is too small.
     """
     config = getattr(plan.recipe.training, name)
-    for option in ("initial", "distill"):
-        if getattr(config, option) and PART_OF[name] not in weights.parts:
-            raise InputError(
-                f"training.{name}.{option}: expected weights to begin with, found none; give "
-                "--init, or set it to 0"
-            )
-
     model = plan.build(weights)
-    intensity = _intensity(plan, weights)
+    intensity = intensity_of(plan, weights)
     loaders = make_loaders(plan, config, intensity)
     # The class weights of the loss (section 4.2 of the paper).
     loss_weights = None
@@ -280,15 +275,55 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
         assert plan.class_counts is not None
         loss_weights = class_weights(plan.class_counts)
     stage = make_stage(plan, name, model, loss_weights)
-    if stage.teachers:
-        plan.report(f"{name}: keeps what --init knows of classes that a dataset lacks (distill)")
+    for line in _notes(plan, name):
+        plan.report(line)
     try:
         fit(stage, plan, loaders, weights, intensity)
     except torch.OutOfMemoryError:
         raise InputError(
             f"{name}: expected steps that fit into the GPU's memory, found {config.batch} scans in "
-            f"{config.accumulate} parts; set --training.{name}.accumulate to more"
+            f"{counted(config.accumulate, 'part')}; raise --training.{name}.accumulate to a larger "
+            "divisor of the batch"
         ) from None
+
+
+def _notes(plan: Plan, name: str) -> Iterator[str]:
+    """Yield lines about classes that a dataset lacks, and about scans that no epoch uses."""
+    config = getattr(plan.recipe.training, name)
+    dataset = plan.scans.dataset
+
+    def listed(row: Any) -> str:
+        return ", ".join(dataset.taxonomy.classes[index] for index in np.flatnonzero(row))
+
+    rivals = _rivals(plan)
+    kept = ", and keep the probabilities of --init there (distill)" if config.distill else ""
+    for member, row in zip(dataset.members, [] if rivals is None else ~rivals, strict=False):
+        if row.any():
+            yield (
+                f"{name}: {member.spec} has hardly a point of {listed(row)}; its scans do not "
+                f"count against these classes{kept}"
+            )
+    if config.distill and plan.taught is not None:
+        absent = ~plan.taught.any(axis=0)
+        if absent.any():
+            yield (
+                f"{name}: no --data has points of {listed(absent)}; the network learns that they "
+                "do not occur, unless a further --data has them, such as simulated streets"
+            )
+
+    if isinstance(dataset, Joined):
+        for places, other in zip(dataset.places, dataset.others, strict=True):
+            used = places * config.epochs
+            if used < len(other.train) and not isinstance(other.dataset, SimulatedStreets):
+                yield (
+                    f"{name}: {used} of {len(other.train)} scans of {other.dataset.spec} are used "
+                    f"in {counted(config.epochs, 'epoch')}; --training.others decides how many"
+                )
+
+
+def _rivals(plan: Plan) -> np.ndarray | None:
+    """Return the `rival_classes` of the datasets, or None if all points count against all."""
+    return None if plan.taught is None else rival_classes(plan.taught)
 
 
 def make_stage(
@@ -300,16 +335,17 @@ def make_stage(
         weights: (K,) class weights of the loss, or None for equal weights.
     """
     config = getattr(plan.recipe.training, name)
+    rivals = _rivals(plan)
     shared: dict[str, Any] = {
         "config": config,
         "taxonomy": plan.scans.dataset.taxonomy,
         "weights": weights,
-        "rivals": plan.rivals,
+        "rivals": rivals,
         "processes": plan.processes,
         "report": plan.report,
     }
     net = model.range_net if name == "rv" else model.polar_net
-    if config.distill and plan.rivals is not None:
+    if config.distill and rivals is not None:
         shared["teacher"] = copy.deepcopy(net)
     if name == "rv":
         return RangeStage(model.range_view, net, **shared)
@@ -338,12 +374,13 @@ def make_loaders(
     return train, make_loader(val_set, 1, shuffle=False, **shared)
 
 
-def _intensity(plan: Plan, weights: Weights) -> TrainedIntensity | None:
-    """Return the distribution to which the intensities of each scan are matched, like `predict`.
+def intensity_of(plan: Plan, weights: Weights) -> TrainedIntensity | None:
+    """Return the intensities that the network learns, as `predict` takes them from its record.
 
     If it is None, intensities stay unchanged.
     """
-    dataset = plan.scans.dataset
-    if isinstance(dataset, SimulatedStreets):
-        return simulated_intensity(dataset.sensor)
-    return trained_intensity(weights.training, weights.sensor)
+    first = plan.scans.dataset.members[0]
+    known = trained_intensity(weights.training, weights.sensor)
+    if isinstance(first, SimulatedStreets):
+        known = simulated_intensity(first.sensor)
+    return learnt_intensity(known, plan.recipe)

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from amvnet.config.schema import Recipe
+from amvnet.config.nested import flat, to_dict
+from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.joined import join
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.datasets.select import TrainingScans, training_records
-from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
+from amvnet.data.datasets.own import OwnScans
+from amvnet.data.datasets.select import TrainingScans, all_to_train
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, describe_difference
 from amvnet.errors import InputError
-from amvnet.inference.reading import normalised, normaliser_for
+from amvnet.inference.reading import expectation_of, normalised
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
-from amvnet.progress import Reporter, report_nothing
+from amvnet.progress import Reporter, counted, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
+from amvnet.sensors.intensity import BLIND_SHARE, TrainedIntensity
+from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.record import MAX_MEASURED_RECORDINGS
 from amvnet.weights.file import Weights, load
 
 
@@ -44,8 +50,9 @@ class Plan:
             ignored.
         class_counts: (K,) number of points of each class in the training scans of an epoch. The
             check of the scans sets it.
-        rivals: (M, K) bool, which classes the points of each of the M datasets count against
-            (`rival_classes`), or None for all. The check of the scans sets it.
+        taught: (M, K) bool, whether each of the M datasets teaches each class (`rival_classes`),
+            or None if all do. The check of the scans sets it.
+        initial: the digests of the parts of the weights to begin with, by part.
         stages: the stages of this call in order, from which the time left is estimated; empty if
             they are unknown.
 
@@ -64,7 +71,8 @@ class Plan:
     scores: ScorePair | None = None
     also_read: Sequence[Path | str | None] = ()
     class_counts: np.ndarray | None = None
-    rivals: np.ndarray | None = None
+    taught: np.ndarray | None = None
+    initial: Mapping[str, str] = field(default_factory=dict)
     stages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -79,14 +87,15 @@ class Plan:
             config = getattr(self.recipe.training, name)
             if config.batch % (size * config.accumulate):
                 raise InputError(
-                    f"expected a batch that {size} processes can share, each in "
-                    f"{config.accumulate} parts, found {config.batch} scans; set "
-                    f"--training.{name}.batch or --training.{name}.accumulate"
+                    f"expected a batch that {counted(size, 'process', 'processes')} can share, "
+                    f"each in {counted(config.accumulate, 'part')}, found {config.batch} scans; "
+                    f"set --training.{name}.batch or --training.{name}.accumulate"
                 )
 
         taxonomy = self.scans.dataset.taxonomy.name
-        # A user's own classes fit any recipe.
-        if taxonomy in TAXONOMIES and taxonomy != self.recipe.taxonomy:
+        # A user's own classes fit any recipe, and any classes fit a recipe without classes.
+        is_open = self.recipe.from_init or taxonomy not in TAXONOMIES
+        if not is_open and taxonomy != self.recipe.taxonomy:
             raise InputError(
                 f"expected a dataset with the classes of {self.recipe.taxonomy}, "
                 f"found {taxonomy}; use the recipe of that benchmark"
@@ -122,7 +131,7 @@ class Plan:
                 scans do not fit the recipe.
         """
         recipe = sized_by_init(recipe, init)
-        dataset, others = open_parts(data, recipe, out, init)
+        dataset, others = open_parts(data, recipe, out, init, report)
         recipe = without_initial_weights(recipe, init, dataset.taxonomy, report)
         scans = join(choose(dataset), others, recipe.training.others)
         return cls(recipe, scans, out, report=report, **settings)
@@ -141,24 +150,23 @@ class Plan:
 
 
 def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
-    """Return a recipe with the classes, the sensor and the sizes of `init`, if it asks for them.
+    """Return a recipe with the sensor and the sizes of `init`, if it asks for them.
 
     Raises:
-        InputError: if the recipe asks for them, and `init` is None.
+        InputError: if the recipe asks for them, and `init` is None or the recipe has sizes itself.
     """
     if not recipe.from_init:
         return recipe
     if init is None:
         raise InputError("expected weights to begin with for this recipe, found none; add --init")
 
-    name = init.taxonomy.name
-    taxonomy = name if name in TAXONOMIES else recipe.taxonomy
-    return dataclasses.replace(
-        recipe,
-        model=init.model,
-        sensor=init.sensor,
-        taxonomy=taxonomy,  # type: ignore[arg-type]
-    )
+    default = dict(flat(to_dict(ModelConfig()), "model"))
+    for key, value in flat(to_dict(recipe.model), "model"):
+        if value != default[key]:
+            raise InputError(
+                f"expected the model of --init, found --{key} {value}; leave the option out"
+            )
+    return dataclasses.replace(recipe, model=init.model, sensor=init.sensor)
 
 
 def without_initial_weights(
@@ -172,24 +180,31 @@ def without_initial_weights(
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
 
+    difference = describe_difference(init.taxonomy.classes, classes.classes, "the data")
     networks = {}
     for name in ("rv", "bev"):
         config = getattr(recipe.training, name)
         if config.initial or config.distill:
             report(
-                f"{name}: neither an average with the initial weights nor a distillation of them, "
-                "because they have other classes"
+                f"{name}: the initial weights have other classes ({difference}), so the result is "
+                "not averaged with them (initial) and keeps no probabilities of theirs (distill)"
             )
             networks[name] = dataclasses.replace(config, initial=0.0, distill=0.0)
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
 
-def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None = None) -> Dataset:
+def open_for_training(
+    data: str,
+    recipe: Recipe,
+    out: Path,
+    init: Weights | None = None,
+    report: Reporter = report_nothing,
+) -> Dataset:
     """Open the dataset of a training.
 
     A user's own scans are normalised as `predict` normalises them: to what the initial weights
     expect, or else to what the weights of an earlier call in `out` expect, or else to the sensor
-    of the recipe.
+    of the recipe. A line reports what is assumed of each of the first recordings.
 
     Raises:
         InputError: if the dataset cannot be opened (`open_dataset`).
@@ -199,18 +214,37 @@ def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None
     earlier = init or _earlier_weights(out)
     if earlier is not None:
         weights = dataclasses.replace(weights, training=earlier.training)
-    return normalised(dataset, normaliser_for(weights))
+    expected = expectation_of(weights)
+    intensity = learnt_intensity(expected.intensity, recipe)
+    expected = dataclasses.replace(expected, intensity=intensity)
+    opened = normalised(dataset, Normaliser(expected, report=report))
+    if isinstance(opened, OwnScans) and opened.normalise is not None:
+        for source, scans in list(opened.recordings().items())[:MAX_MEASURED_RECORDINGS]:
+            with suppress(InputError):  # the check of the scans reports broken ones
+                opened.normalise(scans[0].read(), source)
+    return opened
+
+
+def learnt_intensity(known: TrainedIntensity | None, recipe: Recipe) -> TrainedIntensity | None:
+    """Return the intensities that networks have learnt after a training.
+
+    If the augmentation often hides the intensities, the networks learn to do without them.
+
+    Args:
+        known: the intensities that the networks have learnt before, or None if these are unknown.
+        recipe: the recipe of the training.
+    """
+    if known is None or recipe.training.augment.no_intensity < BLIND_SHARE:
+        return known
+    return dataclasses.replace(known, is_optional=True)
 
 
 def open_parts(
-    specs: Sequence[str], recipe: Recipe, out: Path, init: Weights | None
+    specs: Sequence[str], recipe: Recipe, out: Path, init: Weights | None, report: Reporter
 ) -> tuple[Dataset, list[TrainingScans]]:
     """Open the datasets of a training: the first one, and the scans of the others to mix in."""
-    first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
-    parts = []
-    for dataset in others:
-        parts.append(TrainingScans(dataset, training_records(dataset), val=[]))
-    return first, parts
+    first, *others = [open_for_training(spec, recipe, out, init, report) for spec in specs]
+    return first, [all_to_train(dataset) for dataset in others]
 
 
 def _earlier_weights(out: Path) -> Weights | None:

@@ -55,14 +55,16 @@ def train(
         raise InputError(f"expected --stage head for scores of other models, found {stage}; add it")
 
     check_folder(plan)
-    plan = dataclasses.replace(plan, stages=tuple(names))
+    initial = {} if init is None else init.digests()
+    plan = dataclasses.replace(plan, stages=tuple(names), initial=initial)
 
     # Check all stages before anything is written, and before hours are spent on the first one.
-    weights = _first_weights(plan, init, names)
+    weights = first_weights(plan, init, names)
     for name in names:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
-    counts, rivals = check_data(plan)
-    plan = dataclasses.replace(plan, class_counts=counts, rivals=rivals)
+        _check_initial(plan, name)
+    counts, taught = check_data(plan)
+    plan = dataclasses.replace(plan, class_counts=counts, taught=taught)
     plan.processes.wait()
     if plan.processes.first:
         write_record(plan, stage, init)
@@ -78,6 +80,19 @@ def train(
     if plan.processes.first:
         _draw_curves(plan)
     return path
+
+
+def _check_initial(plan: Plan, name: str) -> None:
+    """Raise InputError if a network needs initial weights that --init does not have."""
+    config = getattr(plan.recipe.training, name)
+    part = PART_OF[name]
+    for option in ("initial", "distill"):
+        if getattr(config, option, 0) and part not in plan.initial:
+            found = f"{', '.join(plan.initial)} in --init" if plan.initial else "none"
+            raise InputError(
+                f"training.{name}.{option}: expected weights of {part} to begin with, found "
+                f"{found}; give --init with this part, or set the option to 0"
+            )
 
 
 def _draw_curves(plan: Plan) -> None:
@@ -118,7 +133,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
     return trained
 
 
-def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> Weights:
+def first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> Weights:
     """Return new weights with the parts of `init`, and the parts that this folder has finished.
 
     If `init` has other classes, its parts are only taken for the stages to train.

@@ -15,6 +15,7 @@ import yaml
 from amvnet.config.nested import flat, to_dict
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.joined import Joined
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write, parse_yaml
 from amvnet.models.methods import BOTH_NETWORKS
@@ -39,9 +40,11 @@ CURVES = "curves.png"
 COUNTS = "class_counts.npz"  # the number of points of each class
 
 # What messages say about settings that are digests.
-SCANS_CHANGED = {
+CHANGED = {
     "scans.train": "other scans to train on",
     "scans.val": "other scans to validate with",
+    "init": "other weights to begin with (--init)",
+    "classes": "other classes or ids of classes",
 }
 MAX_CHANGES = 6  # largest number of changed settings that a message names
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")  # the packages whose versions are recorded
@@ -144,6 +147,8 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
         "model": {key: recipe["model"][key] for key in SIZES[PART_OF[name]]},
         "training": {key: recipe["training"][key] for key in training_keys},
         "scans": {"train": _digest_of_scans(train), "val": _digest_of_scans(val)},
+        "init": plan.initial.get(PART_OF[name]),
+        "classes": _digest_of_classes(plan.scans.dataset.taxonomy),
     }
 
     if plan.scores is not None:
@@ -213,8 +218,8 @@ def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[
             continue
         if name.startswith(("model.", "training.")):
             changes.append(f"{name} {now.get(name)} instead of {before.get(name)}")
-        elif name in SCANS_CHANGED:
-            changes.append(SCANS_CHANGED[name])
+        elif name in CHANGED:
+            changes.append(CHANGED[name])
         else:
             changes.append(f"another {name}")
     return changes
@@ -223,6 +228,12 @@ def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[
 def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
     """Return the sorted names of the sequences of some scans, each once."""
     return sorted({record.sequence for record in records})
+
+
+def _digest_of_classes(taxonomy: Taxonomy) -> str:
+    """Return a digest of the names of the classes in order, and of the raw ids of each."""
+    ids = sorted(taxonomy.raw_to_train.items(), key=str)
+    return hashlib.sha256(repr((taxonomy.classes, ids)).encode()).hexdigest()[:16]
 
 
 def _digest_of_scans(records: Sequence[ScanRecord]) -> str:

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.joined import Joined
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.sensors.intensity import (
     MATCHED_KEY,
     NO_INTENSITY,
+    OPTIONAL_KEY,
     QUANTILES_KEY,
     TrainedIntensity,
     are_quantiles,
@@ -39,7 +39,7 @@ def sensor_record(
     Args:
         dataset: the dataset that reads the scans.
         records: the training scans.
-        intensity: the distribution to which the intensities of the scans are matched.
+        intensity: the intensities that the network learns, or None if these are unknown.
     """
     scans = []
     for sampled in evenly_spaced(records, SAMPLED_SCANS):
@@ -56,9 +56,11 @@ def sensor_record(
     record: dict[str, Any] = {QUANTILES_KEY: mean if is_known else []}
 
     # The weights will get scans that are normalised in the same way, so record the normalisation.
-    first = dataset.dataset if isinstance(dataset, Joined) else dataset
+    first = dataset.members[0]
     normalised = normalised_record(first) if isinstance(first, OwnScans) else {}
     record |= normalised or {SENSOR_KEY: {**measure_sensor(scans), AS_IS_KEY: True}}
-    if intensity is not None and intensity.is_matched:
-        record |= {QUANTILES_KEY: list(intensity.quantiles), MATCHED_KEY: True}
+    if intensity is not None:
+        record[OPTIONAL_KEY] = intensity.is_optional
+        if intensity.is_matched:
+            record |= {QUANTILES_KEY: list(intensity.quantiles), MATCHED_KEY: True}
     return record

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from amvnet.config.schema import ModelConfig
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.layers import ResidualBlock
@@ -41,9 +41,12 @@ def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
             "train it first"
         )
     if weights.taxonomy.classes != other.taxonomy.classes:
+        difference = describe_difference(
+            weights.taxonomy.classes, other.taxonomy.classes, other.taxonomy.name
+        )
         raise InputError(
-            f"expected weights for the classes of {weights.taxonomy.name}, found weights for "
-            f"{other.taxonomy.name}; train this part on the benchmark"
+            f"expected weights for the classes of {weights.taxonomy.name}, found those of "
+            f"{difference}; train this part for these classes, in another folder"
         )
 
     tensors = {}
@@ -98,7 +101,8 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
         seed: the seed of the new parameters.
 
     Returns:
-        The weights, without records of a training, and the names of the new parameters.
+        The weights, without metrics, and the names of the new parameters. The records of the
+        earlier training stay, because they say what scans the networks take.
     """
     with torch.device("meta"):  # takes no memory
         few = build_amvnet(weights.model, 1).state_dict()
@@ -115,7 +119,7 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
         if depends_on_classes:
             new.append(key)
     begun = dataclasses.replace(weights, taxonomy=taxonomy, tensors=tensors)
-    return dataclasses.replace(begun, training={}, metrics={}), new
+    return dataclasses.replace(begun, metrics={}), new
 
 
 def grown(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights | None:
@@ -133,8 +137,9 @@ def grown(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights
         seed: the seed of the other parameters of the new blocks.
 
     Returns:
-        The weights, without a record of the part's training and metrics; None if the parts differ
-        in more than residual blocks and steps.
+        The weights, without the part's metrics; None if the parts differ in more than residual
+        blocks and steps. The record of the part's earlier training stays, because it says what
+        scans the network takes.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -162,7 +167,6 @@ def grown(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights
     return dataclasses.replace(
         resized(weights, part, model),
         tensors=tensors,
-        training=_with_entry(weights.training, {}, part),
         metrics=_with_entry(weights.metrics, {}, part),
     )
 

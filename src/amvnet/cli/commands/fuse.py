@@ -30,10 +30,11 @@ def fuse(
         out: folder for the labels.
         models: the scores of the two models.
         choice: which scans of the inputs to label.
-        head: weights with a point head that was trained on these scores or on networks; default:
-            the ensemble, without a head.
+        head: weights with a point head, trained on the scores of these two models or on the scores
+            of two networks; default: the ensemble, without a head.
         tau: a point is uncertain if the cosine similarity of the two models' scores is at
-            most this value, in [0, 1]; default: the value in the head's weights.
+            most this value, in [0, 1]; default: the value in the head's weights, or 0.85 without a
+            head.
         taxonomy: the classes; default: the classes of the head or of the inputs.
         overwrite: replace files that exist.
     """

@@ -48,4 +48,4 @@ def rank(
     with progress("scoring") as step:
         clusters = rank_records(dataset, records, segmenter, step)
     write_clusters(clusters, records, dataset.taxonomy, out)
-    report(f"{counted(len(clusters), 'cluster')} of {counted(len(records), 'scan')} in {out}")
+    report(f"{counted(len(clusters), 'cluster')} in {counted(len(records), 'scan')}; see {out}")

@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import on_terminal, report
-from amvnet.cli.options import ScoresChoice, TrainingChoice, describe_records, join_processes
+from amvnet.cli.options import (
+    ScoresChoice,
+    TrainingChoice,
+    describe_records,
+    join_processes,
+    report_unused,
+)
 from amvnet.config.schema import Recipe
 
 
@@ -35,7 +41,8 @@ def train(
         out: folder of the run.
         choice: which scans to train on and to validate with.
         models: with --stage head, the scores of two other models to train a head on.
-        stage: which part to train; all trains one part after the other.
+        stage: which part to train; all trains the parts that the recipe lists under stages, one
+            after the other.
         init: weights to begin with; parts that are not trained are copied. From weights with other
             classes, all layers except the last ones are copied. Stages that the folder has finished
             keep the weights of the folder.
@@ -43,6 +50,7 @@ def train(
         with_val: also train on the validation scans, and skip the validation, as for an entry to a
             benchmark.
     """
+    from amvnet.data.datasets.joined import Joined
     from amvnet.models.methods import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
     from amvnet.training.plan import Plan
@@ -65,6 +73,9 @@ def train(
         also_read=(*data, init),
     )
     scans = plan.scans
+    if isinstance(scans.dataset, Joined):
+        for other in scans.dataset.others:
+            report_unused(other, f"{other.dataset.spec}: ")
     report(
         f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}"
     )

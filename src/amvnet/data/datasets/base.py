@@ -69,6 +69,11 @@ class Dataset(ABC):
         """
 
     @property
+    def members(self) -> Sequence[Dataset]:
+        """The datasets that this one joins; the dataset itself if it joins none."""
+        return [self]
+
+    @property
     def is_split(self) -> bool:
         """Whether there is an official split: sequences to train on and to validate with."""
         return bool(self._on_disk("train") and self._on_disk("val"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -58,6 +59,11 @@ class Joined(Dataset):
         # The share and the places in an epoch that each of the others has.
         self.share = share / len(others)
         self.places = _places(len(scans.train), others, share)
+
+    @property
+    def members(self) -> Sequence[Dataset]:
+        """The first dataset, and the others."""
+        return [self.dataset, *(other.dataset for other in self.others)]
 
     @property
     def specs(self) -> list[str]:
@@ -136,11 +142,19 @@ def join(
             each of their scans is in each epoch once.
 
     Raises:
-        InputError: if a dataset has other classes, or the share leaves nothing for the first.
+        InputError: if a dataset has other classes or trains on a scan of `scans.val`, or the share
+            leaves nothing for the first.
     """
     if not others:
         return scans
+    validating = {_identity(record) for record in scans.val}
     for other in others:
+        for record in other.train:
+            if _identity(record) in validating:
+                raise InputError(
+                    f"expected different scans to train on and to validate with, found "
+                    f"{record.points_path} in both; leave it out of {other.dataset.spec}"
+                )
         classes = scans.dataset.taxonomy.classes
         others_classes = other.dataset.taxonomy.classes
         if classes != others_classes:
@@ -153,6 +167,11 @@ def join(
     joined = Joined(scans, others, share)
     train = [*scans.train, *joined.mixed_records()]
     return TrainingScans(joined, train, scans.val, scans.unlabelled)
+
+
+def _identity(record: ScanRecord) -> tuple[str, str]:
+    """Return what identifies a scan in any dataset: its file, and its name in an archive or bag."""
+    return os.path.realpath(record.points_path), record.name.rpartition("/")[2]
 
 
 @cache

@@ -109,11 +109,7 @@ def _require_two(dataset: Dataset) -> None:
 
 def _refuse_test(dataset: Dataset, names: Sequence[str]) -> None:
     """Raise InputError if a sequence to train on belongs to the test split."""
-    try:
-        test = dataset.official("test")
-    except InputError:  # there is none
-        return
-    of_test = sorted(set(names) & set(test))
+    of_test = sorted(set(names) & set(_official(dataset, "test")))
     if of_test:
         raise InputError(
             f"{dataset.spec}: expected sequences to train on outside the test split, found "
@@ -121,11 +117,24 @@ def _refuse_test(dataset: Dataset, names: Sequence[str]) -> None:
         )
 
 
+def _official(dataset: Dataset, split: str) -> tuple[str, ...]:
+    """Return the sequences of an official split, or none if there is no such split."""
+    try:
+        return dataset.official(split)
+    except InputError:
+        return ()
+
+
 def _without(names: Sequence[str], others: Sequence[str]) -> list[str]:
     return [name for name in names if name not in others]
 
 
-def training_records(dataset: Dataset) -> list[ScanRecord]:
-    """Return the labelled scans of the training split, or of a single sequence without a split."""
-    names = _sequences_with_val(dataset, "train")
-    return dataset.labelled(dataset.records(names))
+def all_to_train(dataset: Dataset) -> TrainingScans:
+    """Return the scans of the training split to train on; without a split, all but test and val."""
+    names = dataset.trainable()
+    if dataset.is_split or _official(dataset, "val"):
+        names = _sequences_with_val(dataset, "train")
+    chosen = dataset.records(names)
+    train = dataset.labelled(chosen)
+    used = {record.name for record in train}
+    return TrainingScans(dataset, train, [], [each for each in chosen if each.name not in used])
