@@ -256,7 +256,7 @@ def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_p
         (f"--weights {other}", "weights"),
     ):
         line = refusal(predict(world, out, f"--resume {options}"))
-        assert f"another {key};" in line
+        assert f"other values of {key};" in line
     check_same(out, whole)
 
     (out / JOURNAL).rename(out / UNFINISHED)

@@ -102,7 +102,7 @@ def timing_table(report: Mapping[str, Any]) -> Table:
     points = report["points"]
     title = (
         f"{report['engine']} on {report['device']} in {report['precision']}, "
-        f"{report['threads']} threads: {points:,} points, "
+        f"{counted(report['threads'], 'thread')}: {points:,} points, "
         f"{report['uncertain'] / points:.1%} of them uncertain"
     )
     table = Table(title=title, show_edge=False)

@@ -20,10 +20,10 @@ from amvnet.scan import Scan
 SHOWN_CLASSES = 3  # largest number of classes that the short description of a result names
 
 # The ratio of the odds of an uncertain point to the usual odds, above which labels are doubtful.
-# A ratio of odds suits every tau, a difference of shares does not. With weights from simulated
-# streets, real scans of the right sensor have a ratio of up to 5, both at a tau of 0.5 and at 0.82;
-# scans in another frame or unit have a larger one (docs/log.md).
-UNUSUAL_ODDS = 5.0
+# A ratio of odds suits every tau, a difference of shares does not. With the built-in weights and
+# their tau of 0.85, real scans of the right sensor have a ratio of up to 4; scans in another frame
+# or unit mostly have a larger one (docs/log.md).
+UNUSUAL_ODDS = 4.0
 # The share of uncertain points below which labels are not doubtful, whatever the usual share is.
 # Networks that hardly ever disagree have a usual share near 0.
 FEW_UNCERTAIN = 0.01
