@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
@@ -113,6 +114,7 @@ def test_the_best_weights_are_the_first_with_the_highest_miou(tmp_path: Path) ->
     keep.settings = {}
     keep.record = {}
     keep.started = 0.0
+    keep.seconds_before = 0.0
     keep.highest = -1.0
 
     for epoch, miou in enumerate((0.2, 0.5, 0.5, 0.3, 0.4)):
@@ -126,6 +128,18 @@ def test_the_best_weights_are_the_first_with_the_highest_miou(tmp_path: Path) ->
     kept = {name: load(tmp_path / f"{name}.safetensors").metrics for name in ("best", "last")}
     assert kept["best"]["range_net"] == {"val/miou": 0.5, "epoch": 1}
     assert kept["last"]["range_net"] == {"val/miou": 0.4, "epoch": 4}
+
+
+def test_the_time_of_a_training_is_that_of_all_its_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    for _ in range(2):
+        call = object.__new__(KeepWeights)
+        call.highest, call.started, call.seconds_before = 0.5, time.monotonic(), 0.0
+        calls.append(call)
+    monkeypatch.setattr(time, "monotonic", lambda: calls[0].started + 100)
+    calls[1].load_state_dict(calls[0].state_dict())
+    calls[1].started = calls[0].started + 70
+    assert calls[1].state_dict() == {"highest": 0.5, "seconds": 130}
 
 
 def test_each_batch_has_draws_of_its_own_which_a_resumed_run_repeats() -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from amvnet.config.recipes import load_recipe
-from amvnet.config.schema import Recipe
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import split_records
@@ -25,13 +24,14 @@ from amvnet.sensors.intensity import (
 from amvnet.training.networks import intensity_of, make_loaders
 from amvnet.training.plan import Plan
 from amvnet.training.run import first_weights
+from amvnet.training.run_folder import PART_OF
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights
 
 from fixtures.own_scans import make_own_scans
 from fixtures.tiny import fake_drive, fresh_weights, write_recipe
 
-STAGES = ("rv", "bev")
+BOTH = ("rv", "bev")
 
 
 @pytest.fixture(scope="module", params=["with intensity", "without intensity"])
@@ -59,20 +59,22 @@ def trained_before(weights: Weights, no_intensity: float, is_matched: bool) -> W
     return replace(weights, training={"range_net": record, "polar_net": record})
 
 
-def plan_of(recipe: Recipe, root: Path, out: Path, init: Weights | None) -> Plan:
-    return Plan.open(
-        recipe,
-        [str(root / "robot.yaml")],
-        out,
-        lambda dataset: split_records(dataset, None, None),
-        init,
-    )
-
-
 @pytest.mark.parametrize("hides", [0.0, 0.3])
-@pytest.mark.parametrize("begin", ["none", "same classes", "other classes", "unmatched"])
+@pytest.mark.parametrize(
+    ("begin", "stages"),
+    [
+        ("none", BOTH),
+        ("same classes", BOTH),
+        ("same classes", ("rv",)),
+        ("same classes", ("head",)),
+        ("other classes", BOTH),
+        ("unmatched", BOTH),
+        ("unmatched", ("rv",)),
+        ("unmatched", ("head",)),
+    ],
+)
 def test_predict_gives_finished_weights_the_intensities_of_their_training(
-    own: Path, tmp_path: Path, begin: str, hides: float
+    own: Path, tmp_path: Path, begin: str, stages: tuple[str, ...], hides: float
 ) -> None:
     recipe = load_recipe(str(own / "recipe.yaml"))
     augment = replace(recipe.training.augment, no_intensity=hides)
@@ -82,21 +84,32 @@ def test_predict_gives_finished_weights_the_intensities_of_their_training(
         "none": None,
         "same classes": trained_before(fresh_weights(classes), 0.25, is_matched=True),
         "other classes": trained_before(fresh_weights(), 0.25, is_matched=True),
-        "unmatched": trained_before(fresh_weights(), 0.0, is_matched=False),
+        "unmatched": trained_before(fresh_weights(classes), 0.0, is_matched=False),
     }
     init = inits[begin]
 
-    plan = plan_of(recipe, own, tmp_path / "run", init)
-    weights = first_weights(plan, init, STAGES)
+    data = str(own / "robot.yaml")
+    plan = Plan.open(
+        recipe,
+        [data],
+        tmp_path / "run",
+        lambda dataset: split_records(dataset, None, None),
+        init,
+        stage="all" if stages == BOTH else stages[0],
+    )
+    weights = first_weights(plan, init, stages)
     intensity = intensity_of(plan, weights)
+    if stages == ("head",):
+        intensity = trained_intensity(weights.training, weights.sensor)
     _, val = make_loaders(plan, recipe.training.rv, intensity)
     assert val is not None
     in_training = val.dataset[(0, 0)]
 
     augments = {"augment": {"no_intensity": hides}}
     record = augments | sensor_record(plan.scans.dataset, plan.scans.train, intensity)
-    finished = replace(weights, training={"range_net": record, "polar_net": record})
-    dataset = normalised(open_dataset(str(own / "robot.yaml")), normaliser_for(finished))
+    learnt = {PART_OF[name]: record for name in stages if name != "head"}
+    finished = replace(weights, training={**weights.training, **learnt})
+    dataset = normalised(open_dataset(data), normaliser_for(finished))
     scan = dataset.read(plan.scans.val[0])
     scan = adapt_intensity(scan, trained_intensity(finished.training, finished.sensor))
     np.testing.assert_allclose(scan.points, in_training.points, atol=1e-6)

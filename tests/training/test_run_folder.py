@@ -7,6 +7,7 @@ from pathlib import Path
 import yaml
 
 from amvnet.config.schema import Recipe
+from amvnet.data.datasets.joined import join
 from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.training.plan import Plan
@@ -57,6 +58,14 @@ def test_settings_tell_classes_apart_by_names_order_and_ids(tmp_path: Path) -> N
         settings = stage_settings(Plan(Recipe(), scans, tmp_path / "run"), "rv", fresh_weights())
         found.add(settings["classes"])
     assert len(found) == 4
+
+    # The ids of further datasets count, too.
+    opened = [open_own(tmp_path / f"{number}.yaml") for number in (0, 2)]
+    first, second = (TrainingScans(each, each.records(each.sequences("all")), []) for each in opened)
+    for other in (first, second):
+        plan = Plan(Recipe(), join(first, [other]), tmp_path / "run")
+        found.add(stage_settings(plan, "rv", fresh_weights())["classes"])
+    assert len(found) == 6
 
 
 def test_a_refused_resume_says_which_values_differ(tmp_path: Path) -> None:

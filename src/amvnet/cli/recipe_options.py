@@ -29,6 +29,8 @@ def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
         help="show also every value of the recipe, such as --training.rv.epochs, and exit",
     )
     for name in SECTIONS:
+        if recipe.from_init and name == "model":  # comes from --init
+            continue
         for path, config in _walk(getattr(recipe, name), name):
             group: Any = parser
             if shows_all:
@@ -53,13 +55,19 @@ def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
         values: the texts of all options by name; None for an option that is not given.
 
     Raises:
-        InputError: if a value has the wrong type or is out of its range.
+        InputError: if a value has the wrong type or is out of its range, or the recipe takes the
+            model of --init and an option is for the model.
     """
     tree: dict[str, Any] = {}
     for name, text in values.items():
         if "." not in name or text is None:
             continue
         *path, key = name.split(".")
+        if recipe.from_init and path[0] == "model":
+            raise InputError(
+                f"--{name}: expected no option for the model, because this recipe takes the model "
+                "of --init; leave it out"
+            )
         branch = tree
         for part in path:
             branch = branch.setdefault(part, {})

@@ -31,10 +31,16 @@ def load_recipe(name_or_path: str) -> Recipe:
     of `Recipe` (the paper's sizes) if it has no such key.
 
     Raises:
-        InputError: if there is no such recipe, a key or a value in it is not valid, or its bases
-            form a circle.
+        InputError: if there is no such recipe, a key or a value in it is not valid, its bases form
+            a circle, or it has a model although it takes the model of --init.
     """
-    return from_dict(Recipe, _read_tree(name_or_path, ()), name_or_path)
+    tree = _read_tree(name_or_path, ())
+    if tree.get("from_init") is True and "model" in tree:
+        raise InputError(
+            f"{name_or_path}: expected no section model, because the recipe takes the model of "
+            "--init (from_init), found one; leave it out"
+        )
+    return from_dict(Recipe, tree, name_or_path)
 
 
 def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]:

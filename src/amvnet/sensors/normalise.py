@@ -141,6 +141,10 @@ class Normaliser:
         self._recordings: dict[str, Recording] = {}
         self._reported: set[str] = set()  # recordings whose line was already reported
 
+    def quiet(self) -> None:
+        """Report nothing more."""
+        self._report = report_nothing
+
     def expect(self, source: str, read: Callable[[], Cloud]) -> None:
         """Announce the next scan of a source, before any scan is normalised.
 

@@ -123,7 +123,7 @@ class KeepWeights(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.highest = state_dict["highest"]
-        self.seconds_before = state_dict["seconds"]
+        self.seconds_before = state_dict.get("seconds", 0.0)
 
     def _seconds(self) -> float:
         """Return how long the training has taken, without the time between its calls."""

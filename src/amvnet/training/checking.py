@@ -38,7 +38,7 @@ def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     totals = np.zeros(plan.scans.dataset.taxonomy.size + 1, dtype=np.int64)
     taught = []
     for dataset, splits, counted_records in _datasets_of(plan):
-        checked = check_scans(dataset, splits, _progress(plan), plan.processes)
+        checked = check_scans(dataset, splits, _progress(plan, dataset), plan.processes)
         _refuse(checked)
         totals += checked.count_points(counted_records)
         if isinstance(dataset, SimulatedStreets):  # the streets of later epochs have other classes
@@ -52,14 +52,15 @@ def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     return totals[1:], np.array(taught)
 
 
-def _progress(plan: Plan) -> Progress:
+def _progress(plan: Plan, dataset: Dataset) -> Progress:
     """Return a function that reports tenths of the scans of a dataset as checked."""
     tenths = Tenths()
     size = plan.processes.size
 
     def progress(done: int, total: int) -> None:
         if tenths.ends(done, total):
-            plan.report(f"checked {min(done * size, total * size)} of {total * size} scans")
+            every = total * size
+            plan.report(f"{dataset.spec}: checked {min(done * size, every)} of {every} scans")
 
     return progress
 

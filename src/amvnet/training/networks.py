@@ -307,8 +307,9 @@ def _notes(plan: Plan, name: str) -> Iterator[str]:
         absent = ~plan.taught.any(axis=0)
         if absent.any():
             yield (
-                f"{name}: no --data has points of {listed(absent)}; the network learns that they "
-                "do not occur, unless a further --data has them, such as simulated streets"
+                f"{name}: no --data has more than stray points of {listed(absent)}; the network "
+                "learns that they do not occur, unless a further --data has them, such as "
+                "simulated streets"
             )
 
     if isinstance(dataset, Joined):

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.config.nested import flat, to_dict
-from amvnet.config.schema import ModelConfig, Recipe
+from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.joined import join
 from amvnet.data.datasets.open import open_dataset
@@ -110,6 +109,7 @@ class Plan:
         choose: Callable[[Dataset], TrainingScans],
         init: Weights | None = None,
         *,
+        stage: str = "all",
         report: Reporter = report_nothing,
         **settings: Any,
     ) -> Plan:
@@ -123,6 +123,7 @@ class Plan:
             choose: a function that returns the scans of the first dataset to train on and to
                 validate with.
             init: the weights to begin with.
+            stage: the stage to train, or "all" for the stages of the recipe.
             report: a function that prints a line about what happens.
             settings: further attributes of the plan.
 
@@ -131,10 +132,15 @@ class Plan:
                 scans do not fit the recipe.
         """
         recipe = sized_by_init(recipe, init)
-        dataset, others = open_parts(data, recipe, out, init, report)
-        recipe = without_initial_weights(recipe, init, dataset.taxonomy, report)
-        scans = join(choose(dataset), others, recipe.training.others)
-        return cls(recipe, scans, out, report=report, **settings)
+        stages = recipe.stages if stage == "all" else (stage,)
+        first, *others = [
+            open_for_training(spec, recipe, out, init, stages=stages, report=report)
+            for spec in data
+        ]
+        recipe = without_initial_weights(recipe, init, first.taxonomy, stages, report)
+        mixed = [all_to_train(dataset) for dataset in others]
+        scans = join(choose(first), mixed, recipe.training.others)
+        return cls(recipe, scans, out, report=report, stages=stages, **settings)
 
     def build(self, weights: Weights) -> AMVNet:
         """Return a model with some weights. Parts that the weights lack are initialised at random.
@@ -153,26 +159,26 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
     """Return a recipe with the sensor and the sizes of `init`, if it asks for them.
 
     Raises:
-        InputError: if the recipe asks for them, and `init` is None or the recipe has sizes itself.
+        InputError: if the recipe asks for them, and `init` is None.
     """
     if not recipe.from_init:
         return recipe
     if init is None:
         raise InputError("expected weights to begin with for this recipe, found none; add --init")
 
-    default = dict(flat(to_dict(ModelConfig()), "model"))
-    for key, value in flat(to_dict(recipe.model), "model"):
-        if value != default[key]:
-            raise InputError(
-                f"expected the model of --init, found --{key} {value}; leave the option out"
-            )
     return dataclasses.replace(recipe, model=init.model, sensor=init.sensor)
 
 
 def without_initial_weights(
-    recipe: Recipe, init: Weights | None, classes: Taxonomy, report: Reporter
+    recipe: Recipe,
+    init: Weights | None,
+    classes: Taxonomy,
+    stages: Sequence[str],
+    report: Reporter,
 ) -> Recipe:
     """Return the recipe without averages and distillation of initial weights of other classes.
+
+    A line reports this for each of the stages that are trained.
 
     Their last layers would then be replaced by new ones, which are useless in an average, and
     teach nothing.
@@ -180,16 +186,16 @@ def without_initial_weights(
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
 
-    difference = describe_difference(init.taxonomy.classes, classes.classes, "the data")
+    difference = describe_difference(init.taxonomy.classes, classes.classes, "data")
     networks = {}
     for name in ("rv", "bev"):
         config = getattr(recipe.training, name)
-        if config.initial or config.distill:
+        if name in stages and (config.initial or config.distill):
             report(
-                f"{name}: the initial weights have other classes ({difference}), so the result is "
-                "not averaged with them (initial) and keeps no probabilities of theirs (distill)"
+                f"{name}: --init has other classes ({difference}), so the result is not averaged "
+                "with --init (initial), and keeps no probabilities of --init (distill)"
             )
-            networks[name] = dataclasses.replace(config, initial=0.0, distill=0.0)
+        networks[name] = dataclasses.replace(config, initial=0.0, distill=0.0)
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
 
@@ -198,13 +204,19 @@ def open_for_training(
     recipe: Recipe,
     out: Path,
     init: Weights | None = None,
+    *,
+    stages: Sequence[str] = (),
     report: Reporter = report_nothing,
 ) -> Dataset:
     """Open the dataset of a training.
 
     A user's own scans are normalised as `predict` normalises them: to what the initial weights
     expect, or else to what the weights of an earlier call in `out` expect, or else to the sensor
-    of the recipe. A line reports what is assumed of each of the first recordings.
+    of the recipe.
+
+    Args:
+        stages: the stages to train.
+        report: takes a line about what is assumed of each of the first recordings.
 
     Raises:
         InputError: if the dataset cannot be opened (`open_dataset`).
@@ -215,14 +227,27 @@ def open_for_training(
     if earlier is not None:
         weights = dataclasses.replace(weights, training=earlier.training)
     expected = expectation_of(weights)
-    intensity = learnt_intensity(expected.intensity, recipe)
-    expected = dataclasses.replace(expected, intensity=intensity)
+    # A network that stays as it is does not learn to do without intensities.
+    if {"rv", "bev"} <= set(stages):
+        intensity = learnt_intensity(expected.intensity, recipe)
+        expected = dataclasses.replace(expected, intensity=intensity)
+
     opened = normalised(dataset, Normaliser(expected, report=report))
-    if isinstance(opened, OwnScans) and opened.normalise is not None:
-        for source, scans in list(opened.recordings().items())[:MAX_MEASURED_RECORDINGS]:
-            with suppress(InputError):  # the check of the scans reports broken ones
-                opened.normalise(scans[0].read(), source)
+    if isinstance(opened, OwnScans) and isinstance(opened.normalise, Normaliser):
+        _report_recordings(opened, opened.normalise, report)
     return opened
+
+
+def _report_recordings(dataset: OwnScans, normaliser: Normaliser, report: Reporter) -> None:
+    """Report what is assumed of the first recordings, once and not in every process that reads."""
+    recordings = dataset.recordings()
+    for source, scans in list(recordings.items())[:MAX_MEASURED_RECORDINGS]:
+        with suppress(InputError):  # the check of the scans reports broken ones
+            normaliser(scans[0].read(), source)
+    more = len(recordings) - MAX_MEASURED_RECORDINGS
+    rest = f"; {counted(more, 'further recording')} not shown" if more > 0 else ""
+    report(f"{dataset.spec}: state under sensor what is assumed wrongly{rest}")
+    normaliser.quiet()
 
 
 def learnt_intensity(known: TrainedIntensity | None, recipe: Recipe) -> TrainedIntensity | None:
@@ -237,14 +262,6 @@ def learnt_intensity(known: TrainedIntensity | None, recipe: Recipe) -> TrainedI
     if known is None or recipe.training.augment.no_intensity < BLIND_SHARE:
         return known
     return dataclasses.replace(known, is_optional=True)
-
-
-def open_parts(
-    specs: Sequence[str], recipe: Recipe, out: Path, init: Weights | None, report: Reporter
-) -> tuple[Dataset, list[TrainingScans]]:
-    """Open the datasets of a training: the first one, and the scans of the others to mix in."""
-    first, *others = [open_for_training(spec, recipe, out, init, report) for spec in specs]
-    return first, [all_to_train(dataset) for dataset in others]
 
 
 def _earlier_weights(out: Path) -> Weights | None:

@@ -56,7 +56,7 @@ def train(
 
     check_folder(plan)
     initial = {} if init is None else init.digests()
-    plan = dataclasses.replace(plan, stages=tuple(names), initial=initial)
+    plan = dataclasses.replace(plan, stages=names, initial=initial)
 
     # Check all stages before anything is written, and before hours are spent on the first one.
     weights = first_weights(plan, init, names)
@@ -91,7 +91,8 @@ def _check_initial(plan: Plan, name: str) -> None:
             found = f"{', '.join(plan.initial)} in --init" if plan.initial else "none"
             raise InputError(
                 f"training.{name}.{option}: expected weights of {part} to begin with, found "
-                f"{found}; give --init with this part, or set the option to 0"
+                f"{found}; give --init with this part, set the option to 0, or train another "
+                "--stage"
             )
 
 

@@ -13,9 +13,8 @@ from typing import Any
 import yaml
 
 from amvnet.config.nested import flat, to_dict
-from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.joined import Joined
-from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write, parse_yaml
 from amvnet.models.methods import BOTH_NETWORKS
@@ -116,7 +115,10 @@ def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
     entries.pop(stage, None)
     entries[stage] = entry
     write_yaml(plan.out / RECORD, entries)  # first, because it marks the folder of a run
-    write_yaml(plan.out / RECIPE, to_dict(plan.recipe))
+    recipe = to_dict(plan.recipe)
+    if plan.recipe.from_init:
+        del recipe["model"]
+    write_yaml(plan.out / RECIPE, recipe)
 
 
 def write_yaml(path: Path, tree: dict[str, Any]) -> None:
@@ -148,7 +150,7 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
         "training": {key: recipe["training"][key] for key in training_keys},
         "scans": {"train": _digest_of_scans(train), "val": _digest_of_scans(val)},
         "init": plan.initial.get(PART_OF[name]),
-        "classes": _digest_of_classes(plan.scans.dataset.taxonomy),
+        "classes": _digest_of_classes(plan.scans.dataset.members),
     }
 
     if plan.scores is not None:
@@ -193,6 +195,9 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         )
 
     begun = _entries(folder / SETTINGS)
+    for key in ("init", "classes"):  # which runs of version 0.3 do not have
+        if key in settings:
+            begun.setdefault(key, settings[key])
     if begun != settings:
         changes = describe_changes(begun, settings)
         others = len(changes) - MAX_CHANGES
@@ -230,10 +235,13 @@ def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
     return sorted({record.sequence for record in records})
 
 
-def _digest_of_classes(taxonomy: Taxonomy) -> str:
-    """Return a digest of the names of the classes in order, and of the raw ids of each."""
-    ids = sorted(taxonomy.raw_to_train.items(), key=str)
-    return hashlib.sha256(repr((taxonomy.classes, ids)).encode()).hexdigest()[:16]
+def _digest_of_classes(datasets: Sequence[Dataset]) -> str:
+    """Return a digest of the classes' names in order, and of their raw ids in each dataset."""
+    classes = []
+    for dataset in datasets:
+        ids = sorted(dataset.taxonomy.raw_to_train.items(), key=str)
+        classes.append((dataset.taxonomy.classes, ids))
+    return hashlib.sha256(repr(classes).encode()).hexdigest()[:16]
 
 
 def _digest_of_scans(records: Sequence[ScanRecord]) -> str:

@@ -65,6 +65,7 @@ def train(
         out,
         choose=lambda dataset: choice.scans(dataset, with_val),
         init=weights,
+        stage=stage,
         report=report,
         resume=resume,
         bars=on_terminal(),

@@ -12,8 +12,9 @@ from functools import cache
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.datasets.select import TrainingScans, official_or_none
 from amvnet.data.datasets.simulated import SCANS
+from amvnet.data.formats.find import scan_stem
 from amvnet.data.taxonomy import describe_difference
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -142,18 +143,19 @@ def join(
             each of their scans is in each epoch once.
 
     Raises:
-        InputError: if a dataset has other classes or trains on a scan of `scans.val`, or the share
-            leaves nothing for the first.
+        InputError: if a dataset has other classes, or scans to train on that the first dataset
+            validates or tests with, or the share leaves nothing for the first.
     """
     if not others:
         return scans
-    validating = {_identity(record) for record in scans.val}
+    test = official_or_none(scans.dataset, "test")
+    apart = {_identity(record) for record in (*scans.val, *scans.dataset.records(test))}
     for other in others:
         for record in other.train:
-            if _identity(record) in validating:
+            if _identity(record) in apart:
                 raise InputError(
-                    f"expected different scans to train on and to validate with, found "
-                    f"{record.points_path} in both; leave it out of {other.dataset.spec}"
+                    "expected scans to train on apart from those to validate or to test with, "
+                    f"found {record.points_path} among both; leave it out of {other.dataset.spec}"
                 )
         classes = scans.dataset.taxonomy.classes
         others_classes = other.dataset.taxonomy.classes
@@ -171,7 +173,8 @@ def join(
 
 def _identity(record: ScanRecord) -> tuple[str, str]:
     """Return what identifies a scan in any dataset: its file, and its name in an archive or bag."""
-    return os.path.realpath(record.points_path), record.name.rpartition("/")[2]
+    in_file = record.name.partition(f"{scan_stem(record.points_path)}/")[2]
+    return os.path.realpath(record.points_path), in_file
 
 
 @cache

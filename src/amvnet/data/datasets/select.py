@@ -109,7 +109,7 @@ def _require_two(dataset: Dataset) -> None:
 
 def _refuse_test(dataset: Dataset, names: Sequence[str]) -> None:
     """Raise InputError if a sequence to train on belongs to the test split."""
-    of_test = sorted(set(names) & set(_official(dataset, "test")))
+    of_test = sorted(set(names) & set(official_or_none(dataset, "test")))
     if of_test:
         raise InputError(
             f"{dataset.spec}: expected sequences to train on outside the test split, found "
@@ -117,7 +117,7 @@ def _refuse_test(dataset: Dataset, names: Sequence[str]) -> None:
         )
 
 
-def _official(dataset: Dataset, split: str) -> tuple[str, ...]:
+def official_or_none(dataset: Dataset, split: str) -> tuple[str, ...]:
     """Return the sequences of an official split, or none if there is no such split."""
     try:
         return dataset.official(split)
@@ -130,10 +130,20 @@ def _without(names: Sequence[str], others: Sequence[str]) -> list[str]:
 
 
 def all_to_train(dataset: Dataset) -> TrainingScans:
-    """Return the scans of the training split to train on; without a split, all but test and val."""
-    names = dataset.trainable()
-    if dataset.is_split or _official(dataset, "val"):
-        names = _sequences_with_val(dataset, "train")
+    """Return the scans of the training split to train on; without a split, all but test and val.
+
+    Raises:
+        InputError: if there are none.
+    """
+    if dataset.is_split:
+        names = list(_sequences_with_val(dataset, "train"))
+    else:
+        names = _without(dataset.trainable(), official_or_none(dataset, "val"))
+    if not names:
+        raise InputError(
+            f"{dataset.spec}: expected sequences to train on, found none outside val and test; "
+            "correct the split, or leave out this --data"
+        )
     chosen = dataset.records(names)
     train = dataset.labelled(chosen)
     used = {record.name for record in train}
