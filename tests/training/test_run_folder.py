@@ -60,8 +60,10 @@ def test_settings_tell_classes_apart_by_names_order_and_ids(tmp_path: Path) -> N
     assert len(found) == 4
 
     # The ids of further datasets count, too.
-    opened = [open_own(tmp_path / f"{number}.yaml") for number in (0, 2)]
-    first, second = (TrainingScans(each, each.records(each.sequences("all")), []) for each in opened)
+    first, second = (
+        TrainingScans(data, data.records(data.sequences("all")), [])
+        for data in (open_own(tmp_path / f"{number}.yaml") for number in (0, 2))
+    )
     for other in (first, second):
         plan = Plan(Recipe(), join(first, [other]), tmp_path / "run")
         found.add(stage_settings(plan, "rv", fresh_weights())["classes"])
