@@ -393,7 +393,7 @@ class TrainingConfig(Checked):
     others: Share = 0.0
     """Share of an epoch that the second and later --data take together; 0: take all their scans."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
-    """Seed of the initial weights, the order of the scans and the augmentation."""
+    """Seed of the initial weights, the order of the scans in an epoch and the augmentation."""
     workers: Annotated[int, Range(0, 1024)] = 0
     """Number of worker processes that read and augment scans; 0: the training itself does it."""
     precision: Literal["auto", "32-true", "bf16-mixed", "16-mixed", "64-true"] = "32-true"
