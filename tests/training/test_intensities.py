@@ -28,24 +28,25 @@ from amvnet.training.run_folder import PART_OF
 from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights
 
-from fixtures.own_scans import make_own_scans
-from fixtures.tiny import fake_drive, fresh_weights, write_recipe
+from fixtures.tiny import fake_drive, fresh_weights, street, write_recipe
 
 BOTH = ("rv", "bev")
 
 
 @pytest.fixture(scope="module", params=["with intensity", "without intensity"])
 def own(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Scans of five classes; their intensities, if any, are darker than the simulated ones."""
+    """Scans of two classes; their intensities, if any, are darker than the simulated ones."""
     root = tmp_path_factory.mktemp("own")
-    make_own_scans(root)
-    for path in root.rglob("*.pcd"):
-        head, marker, rows = path.read_bytes().partition(b"DATA binary\n")
-        table = np.frombuffer(rows, np.float32).reshape(-1, 4).copy()
-        table[:, 3] *= 0.1
-        if request.param == "without intensity":
-            head = head.replace(b"intensity", b"unknown")
-        path.write_bytes(head + marker + table.tobytes())
+    columns = 4 if request.param == "with intensity" else 3
+    for seed, site in enumerate("ab"):
+        for name in ("clouds", "truth"):
+            (root / site / name).mkdir(parents=True)
+        points, _ = street(seed)
+        np.save(root / site / "clouds/0.npy", (points * [1, 1, 1, 0.1])[:, :columns])
+        np.save(root / site / "truth/0.npy", np.where(points[:, 2] < -1, 3, 7))
+    (root / "robot.yaml").write_text(
+        "{classes: {ground: 3, plant: 7}, scans: '*/clouds/*.npy', labels: '../truth/{name}.npy'}"
+    )
     write_recipe(root / "recipe.yaml")
     return root
 
