@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import re
 import shutil
@@ -11,7 +12,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import yaml
 from yaml.reader import ReaderError
@@ -120,6 +121,65 @@ def publish(part: Path, path: Path) -> None:
             os.fsync(folder)
     finally:
         os.close(folder)
+
+
+@contextmanager
+def alone_in(folder: Path, lock: str = ".lock") -> Iterator[None]:
+    """Keep other runs out of an output folder during the block. The folder is made if necessary.
+
+    The lock ends with the process, however it ends.
+
+    Args:
+        folder: the output folder.
+        lock: the name of the file that is locked, which exists only during the block.
+
+    Raises:
+        InputError: if another run has the lock, or the folder cannot be written to.
+    """
+    make_folder(folder)
+    path = folder / lock
+    file = _open_locked(path)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        file.close()
+
+
+def _open_locked(path: Path) -> IO[str]:
+    while True:
+        try:
+            file = path.open("a")
+        except OSError as error:
+            if error.errno not in REFUSALS:
+                raise
+            raise InputError(
+                f"{path.parent}: expected a folder to write to, found {error.strerror}; give "
+                "another"
+            ) from None
+
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            raise InputError(
+                f"{path.parent}: expected a folder for this run alone, found another run that is "
+                "writing into it; wait until it ends, or change --out"
+            ) from None
+        except OSError:
+            return file  # some network file systems have no locks
+
+        # The run that had the lock may have removed the file after it was opened here.
+        if path.exists() and path.stat().st_ino == os.fstat(file.fileno()).st_ino:
+            return file
+        file.close()
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove the files that killed runs have not finished in a folder and in folders inside it."""
+    for path in folder.rglob(UNFINISHED_FILES):
+        if path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def inside(folder: Path | str, name: Path | str) -> Path:

@@ -19,7 +19,7 @@ from pyarrow.fs import FileType
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import UNFINISHED_FILES
+from amvnet.files import remove_unfinished
 from amvnet.fleet.manifest import NameSet
 from amvnet.fleet.storage import Place, reaching
 from amvnet.inference.journal import check_settings
@@ -154,8 +154,7 @@ class Results:
     def _remove_unfinished(self) -> None:
         """Remove the unfinished files that killed processes have left on this machine."""
         if self.out.local is not None:
-            for path in self.out.local.rglob(UNFINISHED_FILES):
-                path.unlink(missing_ok=True)
+            remove_unfinished(self.out.local)
 
     def _keep_done(self) -> None:
         """Collect the scans that are done, and remove the rows of all other scans."""

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
-from collections.abc import Iterable, Iterator, Mapping, Set
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Set
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from amvnet.errors import InputError
-from amvnet.files import UNFINISHED_FILES, atomic_write, make_folder
+from amvnet.files import alone_in, atomic_write, remove_unfinished
 from amvnet.progress import counted
 
 JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
@@ -61,23 +59,19 @@ class Journal:
         self.folder = folder
         self.path = folder / UNFINISHED
 
-        make_folder(folder)
-        with _lock(folder):
-            _check_alone(folder)
-            _write(self.path, settings, done)
-            self._file = self.path.open("a")
-            with suppress(OSError):  # some network file systems have no locks
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            (folder / JOURNAL).unlink(missing_ok=True)
-            for path in folder.rglob(UNFINISHED_FILES):  # earlier runs did not finish these files
-                if path.is_file():
-                    path.unlink()
+        self._alone = ExitStack()
+        self._alone.enter_context(alone_in(folder))
+        remove_unfinished(folder)
+        _write(self.path, settings, done)
+        self._file = self.path.open("a")
+        (folder / JOURNAL).unlink(missing_ok=True)
 
     def __enter__(self) -> Journal:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
+        self._alone.close()
 
     def add(self, entry: Entry) -> None:
         """Add the entry of a scan that is done."""
@@ -154,30 +148,6 @@ def check_settings(
             f"{place}: expected the settings of the earlier run, found other values of "
             f"{', '.join(changed)}; resume it with the same settings, or {advice}"
         )
-
-
-@contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Keep other processes out of this block for the same folder."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _check_alone(folder: Path) -> None:
-    """Raise InputError if another run has locked the journal."""
-    with suppress(OSError), (folder / UNFINISHED).open() as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"{folder}: expected a folder for this run alone, found another run that is "
-                "writing into it; wait until it ends, or change --out"
-            ) from None
 
 
 def _write(path: Path, settings: Mapping[str, Any], entries: Iterable[Entry]) -> None:

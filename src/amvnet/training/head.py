@@ -29,6 +29,8 @@ VAL_FACTOR = 64  # size of a validation batch, in training batches
 class HeadStage(Stage):
     """Stage `head`. It learns from scores that were gathered beforehand by frozen networks.
 
+    It always computes in float32: it is so small that a lower precision would save nothing.
+
     Args:
         head: the point head.
         train: the points to learn from.
@@ -37,7 +39,6 @@ class HeadStage(Stage):
     """
 
     name = "head"
-    in_float32 = True  # the head is so small that a lower precision would save nothing
     config: HeadTraining
 
     def __init__(

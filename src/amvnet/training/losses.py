@@ -133,12 +133,10 @@ def network_loss(
             their own class; None for all classes. `scored` must have sources then.
 
     Returns:
-        The loss: a scalar of type float32, or float64 if the logits have it. The loss of a scan
-        without labels is 0.
+        The loss: a scalar of the logits' type. The loss of a scan without labels is 0.
     """
     labelled = (scored.labels > 0).nonzero()[:, 0]
     logits = scored.logits.index_select(0, labelled)
-    logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
     classes = scored.labels.index_select(0, labelled).long() - 1
     scan = scored.scan.index_select(0, labelled)
     if rivals is not None:
@@ -181,10 +179,8 @@ def distillation_loss(scored: Scored, teacher: Tensor, rivals: Tensor) -> Tensor
     others = competes.index_select(0, index)  # (N, K) bool, the classes that are not left out
     scan = scored.scan.index_select(0, index)
 
-    logits = scored.logits.index_select(0, index)
-    precision = torch.promote_types(logits.dtype, torch.float32)
-    log = logits.to(precision).log_softmax(dim=1)
-    target = teacher.index_select(0, index).to(precision).softmax(dim=1)
+    log = scored.logits.index_select(0, index).log_softmax(dim=1)
+    target = teacher.index_select(0, index).softmax(dim=1)
     log_of_others = log.masked_fill(~others, -torch.inf).logsumexp(dim=1)
     losses = -(target * log).masked_fill(others, 0).sum(dim=1)
     losses = losses - target.masked_fill(~others, 0).sum(dim=1) * log_of_others
@@ -230,10 +226,8 @@ def dice(probabilities: Tensor, targets: Targets) -> Tensor:
     truth = F.one_hot(targets.classes, probabilities.shape[1]).to(probabilities)
     members = F.one_hot(targets.scan, len(targets.counts)).to(probabilities).T  # (B, P)
 
-    # Mixed precision would multiply these matrices in half precision.
-    with torch.autocast(probabilities.device.type, enabled=False):
-        overlap = members @ (probabilities * truth)  # (B, K)
-        size = members @ probabilities + targets.counts
+    overlap = members @ (probabilities * truth)  # (B, K)
+    size = members @ probabilities + targets.counts
     losses = 1 - 2 * overlap / size.clamp_min(1e-6)
     return (losses * targets.shares(losses.dtype)).sum()
 

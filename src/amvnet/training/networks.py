@@ -35,10 +35,12 @@ from amvnet.training.losses import (
 )
 from amvnet.training.muon import Muon
 from amvnet.training.plan import Plan, learnt_intensity
-from amvnet.training.stage import Loaders, Stage, fit
+from amvnet.training.stage import HALF, MIXED, Loaders, Stage, fit, precision_of
 from amvnet.weights.file import Weights
 
 Batch = tuple[PointBatch, Tensor, Tensor]  # points, their (P,) train ids and (P,) sources
+# The types in which the networks of a mixed precision compute.
+LOWER = {MIXED: torch.bfloat16, HALF: torch.float16}
 REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 
 
@@ -84,6 +86,18 @@ class NetworkStage(Stage):
         # The number of batches in the epoch, and the number of batches with a labelled point.
         self.batches = 0
         self.labelled: Tensor | int = 0
+
+    def in_precision(self, net: nn.Module, view: Any) -> Tensor:
+        """Return the logits of a network, computed in the precision of the stage.
+
+        As in prediction (`InPrecision`), a lower precision ends with the network: projections,
+        probabilities and losses keep the precision of the weights.
+        """
+        dtype = LOWER.get(self.precision)
+        kind = self.device.type
+        with torch.autocast(kind, dtype, enabled=dtype is not None, cache_enabled=False):
+            logits: Tensor = net(view)
+        return logits.to(self.dtype)
 
     def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
         """Return the pixels or voxels that the loss compares with their labels.
@@ -170,7 +184,7 @@ class NetworkStage(Stage):
     def configure_optimizers(self) -> Any:
         # On a GPU, a fused optimizer takes the whole step in one launch. With it, Lightning cannot
         # clip the scaled gradients of float16.
-        is_fused = self.device.type == "cuda" and self.trainer.precision != "16-mixed"
+        is_fused = self.device.type == "cuda" and self.precision != HALF
         options: dict[str, Any] = {
             "lr": self.config.lr,
             "weight_decay": self.config.weight_decay,
@@ -191,7 +205,7 @@ class RangeStage(NetworkStage):
     def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
         points, labels, source = batch
         view = self.view.project(points)
-        image = (net or self.trained)(view.image)  # (B, K, H, W)
+        image = self.in_precision(net or self.trained, view.image)  # (B, K, H, W)
         pixels = image.permute(0, 2, 3, 1).flatten(0, 2)  # (B * H * W, K)
 
         # Pixels without a point have no label.
@@ -207,7 +221,7 @@ class RangeStage(NetworkStage):
 
     def score(self, batch: PointBatch) -> Tensor:
         view = self.view.project(batch)
-        return view.to_points(self.trained(view.image).softmax(dim=1))
+        return view.to_points(self.in_precision(self.trained, view.image).softmax(dim=1))
 
 
 class PolarStage(NetworkStage):
@@ -220,11 +234,12 @@ class PolarStage(NetworkStage):
     def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
         points, labels, source = batch
         view = self.view.project(points)
-        return _score_voxels(view, (net or self.trained)(view), labels, source)
+        logits = self.in_precision(net or self.trained, view)
+        return _score_voxels(view, logits, labels, source)
 
     def score(self, batch: PointBatch) -> Tensor:
         view = self.view.project(batch)
-        return view.to_points(self.trained(view))
+        return view.to_points(self.in_precision(self.trained, view))
 
 
 def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tensor) -> Scored:
@@ -344,6 +359,7 @@ def make_stage(
         "rivals": rivals,
         "processes": plan.processes,
         "report": plan.report,
+        "precision": precision_of(plan.recipe.training),
     }
     net = model.range_net if name == "rv" else model.polar_net
     if config.distill and rivals is not None:

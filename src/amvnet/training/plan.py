@@ -223,9 +223,8 @@ def open_for_training(
     """
     dataset = open_dataset(data)
     weights = Weights(recipe.model, dataset.taxonomy, recipe.sensor)
-    earlier = init or _earlier_weights(out)
-    if earlier is not None:
-        weights = dataclasses.replace(weights, training=earlier.training)
+    records = _earlier_records(out) if init is None else init.training
+    weights = dataclasses.replace(weights, training=records)
     expected = expectation_of(weights)
     # A network that stays as it is does not learn to do without intensities.
     if {"rv", "bev"} <= set(stages):
@@ -264,10 +263,14 @@ def learnt_intensity(known: TrainedIntensity | None, recipe: Recipe) -> TrainedI
     return dataclasses.replace(known, is_optional=True)
 
 
-def _earlier_weights(out: Path) -> Weights | None:
-    """Return the weights that an earlier call has written into the folder, or None."""
-    for name in ("weights", "rv/last", "bev/last"):
-        path = out / f"{name}.safetensors"
-        if path.is_file():
-            return load(path)
-    return None
+def _earlier_records(out: Path) -> Mapping[str, Any]:
+    """Return the training records of the networks that earlier calls have written into a folder."""
+    paths = [out / f"{name}.safetensors" for name in ("rv/last", "bev/last")]
+    paths = [path for path in paths if path.is_file()]
+    whole = out / "weights.safetensors"
+    if not paths and whole.is_file():  # the networks of --init
+        paths = [whole]
+    records: dict[str, Any] = {}
+    for path in paths:
+        records |= load(path).training
+    return records

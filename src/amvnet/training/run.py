@@ -22,6 +22,7 @@ from amvnet.training.run_folder import (
     DONE,
     PART_OF,
     WEIGHTS,
+    alone_in_run,
     check_begun,
     check_folder,
     is_finished,
@@ -47,8 +48,9 @@ def train(
 
     Raises:
         InputError: if the head is to be trained before the networks; if the folder holds a run
-            that was begun with other settings, or that is not to be resumed; or if the check of
-            the data (`check_data`) finds an error.
+            that was begun with other settings, or that is not to be resumed; if another call is
+            training one of the stages there; or if the check of the data (`check_data`) finds an
+            error.
     """
     names = plan.recipe.stages if stage == "all" else (stage,)
     if plan.scores is not None and names != ("head",):
@@ -57,7 +59,13 @@ def train(
     check_folder(plan)
     initial = {} if init is None else init.digests()
     plan = dataclasses.replace(plan, stages=names, initial=initial)
+    with alone_in_run(plan, stage):
+        return _train_stages(plan, stage, init)
 
+
+def _train_stages(plan: Plan, stage: str, init: Weights | None) -> Path:
+    """Train the stages of a plan in a folder that no other call writes into."""
+    names = plan.stages
     # Check all stages before anything is written, and before hours are spent on the first one.
     weights = first_weights(plan, init, names)
     for name in names:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from amvnet.config.nested import flat, to_dict
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.joined import Joined
 from amvnet.errors import InputError
-from amvnet.files import atomic_write, parse_yaml
+from amvnet.files import alone_in, atomic_write, parse_yaml, remove_unfinished
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.outputs import check_not_read
 from amvnet.training.plan import Plan
@@ -74,6 +75,36 @@ def check_folder(plan: Plan) -> None:
                 f"{plan.out}: expected a new folder or the folder of a run, found {name} without "
                 f"{RECORD}; give another folder"
             )
+
+
+@contextmanager
+def alone_in_run(plan: Plan, stage: str) -> Iterator[None]:
+    """Keep out other calls that train the same stages, and remove what killed calls have left.
+
+    Both networks may be trained at the same time, by two calls. Of the processes that share a call,
+    the first one does this.
+
+    Args:
+        stage: the stage of this call, or "all".
+
+    Raises:
+        InputError: if another call is training one of the stages.
+    """
+    if not plan.processes.first:
+        yield
+        return
+
+    is_new = not plan.out.exists()
+    try:
+        with ExitStack() as locks:
+            for name in PART_OF if stage == "all" else (stage,):
+                locks.enter_context(alone_in(plan.out, f".{name}.lock"))
+            remove_unfinished(plan.out if stage == "all" else plan.out / stage)
+            yield
+    finally:
+        if is_new:
+            with suppress(OSError):  # the folder is empty only if the check found an error
+                plan.out.rmdir()
 
 
 def is_finished(plan: Plan, name: str) -> bool:

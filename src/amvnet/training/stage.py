@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 import pickle
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -20,6 +23,7 @@ from lightning.pytorch.callbacks import (
     RichProgressBar,
 )
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins import MixedPrecision, TorchCheckpointIO
 from lightning.pytorch.strategies import DDPStrategy
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -29,6 +33,7 @@ from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
+from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes, device_of, environment
@@ -47,6 +52,7 @@ Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 SINGLE: Final = "32-true"
 DOUBLE: Final = "64-true"
 MIXED: Final = "bf16-mixed"
+HALF: Final = "16-mixed"
 
 # The loaders of the batches to learn from and to validate with. The second one is None if nothing
 # is validated.
@@ -61,11 +67,11 @@ class Stage(L.LightningModule):
         taxonomy: the K classes.
         processes: the processes that share the run.
         report: a function that prints a line about what happens.
+        precision: the precision of the forward and backward passes.
     """
 
     name: str  # the value of --stage
     trained: nn.Module  # the part of the model that this stage trains
-    in_float32 = False  # whether the stage ignores the precision of the recipe
 
     # The mIoU that chooses the best weights, if `val/miou` does not depend on the trained part.
     own_miou: float | None = None
@@ -76,12 +82,14 @@ class Stage(L.LightningModule):
         taxonomy: Taxonomy,
         processes: Processes = ALONE,
         report: Reporter = report_nothing,
+        precision: Precision = SINGLE,
     ) -> None:
         super().__init__()
         self.config = config
         self.taxonomy = taxonomy
         self.processes = processes
         self.report = report
+        self.precision = precision
         self.matrix = self.empty_matrix()
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
@@ -176,6 +184,34 @@ class KeepSignals(Callback):
             signal.signal(signal.SIGTERM, self._handler)
 
 
+class ScaledLoss(MixedPrecision):
+    """Scales the loss of 16-mixed, so that small gradients do not vanish in float16.
+
+    A stage itself decides what computes in float16, and not Lightning.
+    """
+
+    @contextmanager
+    def forward_context(self) -> Iterator[None]:
+        yield
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Writes a checkpoint into its folder, and keeps the earlier one until the new one is whole.
+
+    Lightning writes into the system's temporary folder first. If that is on another file system,
+    it then copies over the earlier checkpoint.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        # PyTorch reports a full disk without its reason, so a plain file writes the bytes.
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        with atomic_write(path) as part:
+            part.write_bytes(content.getbuffer())
+
+
 def fit(
     stage: Stage,
     plan: Plan,
@@ -201,12 +237,11 @@ def fit(
     stage.train()
     train, val = loaders
     device = device_of(plan.recipe.training.accelerator)
-    precision = SINGLE if stage.in_float32 else precision_of(plan.recipe.training)
     if device == "cpu":
         keep_freed_memory()
     if plan.processes.size > 1:
         synchronise_batch_norms(stage.trained, cuda=device == "cuda")
-    if precision == DOUBLE:
+    if stage.precision == DOUBLE:
         stage.double()
 
     folder = plan.out / stage.name
@@ -219,14 +254,15 @@ def fit(
     # Buffers need no broadcast, because synchronised batch norms have the same statistics in all
     # processes. A broadcast would even block, because processes may validate unequal shares.
     ddp = DDPStrategy(broadcast_buffers=False)
+    plugins: list[Any] = [environment(), WholeCheckpoints()]
+    if stage.precision == HALF:
+        plugins.append(ScaledLoss(HALF, device))
     trainer = L.Trainer(
-        # Lightning's double precision does not convert our batches, so `stage.double()` does it.
-        precision=SINGLE if precision == DOUBLE else precision,
         accelerator=plan.recipe.training.accelerator,
         devices=plan.processes.size // plan.processes.nodes,  # on each machine
         num_nodes=plan.processes.nodes,
         strategy=ddp if plan.processes.size > 1 else "auto",
-        plugins=[environment()],
+        plugins=plugins,
         max_epochs=stage.config.epochs,
         limit_val_batches=0 if val is None else None,
         accumulate_grad_batches=getattr(stage.config, "accumulate", 1),
