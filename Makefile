@@ -1,12 +1,13 @@
 # Everything runs in the virtual environment .venv.
 PYTHON ?= python3
 BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # Each processor runs one process with one thread. One process runs all tests of a file, because they share what they make.
-SPREAD := OMP_NUM_THREADS=1
-# The least share of lines that `make test COVERAGE=1` must run, in percent: raise it to two points below what CI prints.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+# The least share of lines that `make test-full COVERAGE=1` must run, in percent: raise it to two points below what CI prints.
 COVERAGE_FLOOR := 90
 
-.PHONY: install demo test run-tests test-slow bench gpu docs lint format release clean
+.PHONY: install demo test test-full quick-tests all-tests bench gpu docs lint format release clean
 
 install: .venv/installed  ## the package and all that its tests need, in .venv
 
@@ -14,14 +15,17 @@ demo: .venv/installed  ## simulate streets, segment and score them, and show all
 	$(BIN)/amvnet demo --out demo --overwrite
 
 # Style and types are checked beside the tests, because mypy uses one processor for a minute. Each tool prints all that it found at once.
-test: .venv/installed  ## style, types and the tests; COVERAGE=1 fails if they run too few lines
-	@$(MAKE) --no-print-directory --jobs=2 lint run-tests
+test: .venv/installed  ## style, types and the tests of each change, in about 4 minutes on two cores
+	@$(MAKE) --no-print-directory --jobs=2 lint quick-tests
 
-run-tests: .venv/installed
-	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile $(if $(COVERAGE),--cov=amvnet --cov=lidarstreets --cov-report=term:skip-covered --cov-fail-under=$(COVERAGE_FLOOR))
+test-full: .venv/installed .venv/fleet  ## style, types and all tests, also of fleets, as CI runs them; COVERAGE=1 fails if they run too few lines
+	@$(MAKE) --no-print-directory --jobs=2 lint all-tests
 
-test-slow: .venv/installed .venv/fleet  ## all tests, also the tests that take minutes and the tests of fleets
-	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"
+quick-tests: .venv/installed
+	$(PYTEST)
+
+all-tests: .venv/installed .venv/fleet
+	$(PYTEST) -m "full or not full" $(if $(COVERAGE),--cov=amvnet --cov=lidarstreets --cov-report=term:skip-covered --cov-fail-under=$(COVERAGE_FLOOR))
 
 bench: .venv/installed  ## the time of a scan, and the gain by each optimisation, in half an hour; SCAN="--scan FILE" for a scan of yours
 	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8
@@ -31,6 +35,7 @@ gpu: .venv/installed  ## on a machine with a GPU: its tests and its tables, to p
 	$(BIN)/python benchmarks/gpu.py $(SCAN)
 
 docs: .venv/docs docs/try/node_modules  ## the site of docs/, in site/
+	@echo "building the site of docs/ in site/: half a minute"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: .venv/installed
@@ -47,23 +52,27 @@ release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushin
 
 # torch is installed first and alone, with a pinned version, so that no other build of it is installed.
 .venv/installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[simulate,formats,export,test]"
-	touch $@
+	@echo "installing PyTorch in .venv: a minute, or several with a slow connection"
+	@$(PYTHON) -m venv .venv
+	@$(PIP) torch
+	@echo "installing amvnet and what its tests need: a minute, or several with a slow connection"
+	@$(PIP) --editable ".[simulate,formats,export,test]"
+	@touch $@
 
 # These packages take 600 MB, so `make test` does not need them.
 .venv/fleet: .venv/installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fleet]" "moto[server]>=5" duckdb "dask[dataframe]"
-	touch $@
+	@echo "installing Ray and what the tests of fleets need: a minute, or several with a slow connection"
+	@$(PIP) --editable ".[fleet]" "moto[server]>=5" duckdb "dask[dataframe]"
+	@touch $@
 
 .venv/docs: .venv/installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
-	touch $@
+	@echo "installing MkDocs: half a minute"
+	@$(PIP) --editable ".[docs]"
+	@touch $@
 
 # The packages that the page docs/try and its tests need. Without npm, the build reports that it leaves the page out.
 docs/try/node_modules: docs/try/package-lock.json
-	if command -v npm > /dev/null; then npm ci --prefix docs/try --ignore-scripts --no-audit --no-fund --silent; fi
+	@if command -v npm > /dev/null; then echo "installing the packages of the page docs/try: a few seconds" && npm ci --prefix docs/try --ignore-scripts --no-audit --no-fund --silent; fi
 
 clean:
 	rm -rf .venv demo site build docs/try/node_modules

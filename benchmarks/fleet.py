@@ -7,7 +7,7 @@ The first command prints the time that `predict` and `fleet` take to start, and 
 file. Then it compares the labels that `fleet` writes to a bucket with the labels that `predict`
 writes, also after a worker and the driver are killed. The second command plans a manifest of
 made-up names twice, and prints the memory that it takes. Both need the packages of
-`make test-slow`.
+`make test-full`.
 """
 
 from __future__ import annotations

@@ -337,7 +337,7 @@ def test_export_keeps_to_it_before_it_exports(world: Path, tmp_path: Path) -> No
     assert files(tmp_path) == {DESCRIPTION}
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_export_replaces_its_graphs_if_told_to(world: Path, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     command = f"export --weights {world}/w.safetensors --out {tmp_path}"

@@ -90,7 +90,7 @@ def run(words: list[str], folder: Path) -> None:
     assert process.returncode == 0, process.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_commands_on_training_run(downloads: Path) -> None:
     count = 0
     for words in commands_of("docs/training.md"):

@@ -366,7 +366,7 @@ def test_a_newer_request_ends_the_work_on_an_older_one(plain: dict[str, Any]) ->
     assert folders == {WEIGHTS["nuscenes"], OWN}  # the older request needs the other weights
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_webgpu_gives_the_labels_of_the_cpu(folder: Path, session: Session, tmp_path: Path) -> None:
     with served(folder, ISOLATION) as site:
         case = {"file": str(session.files["own"]), "model": 2}

@@ -125,7 +125,7 @@ def test_onnx_takes_the_fastest_provider_that_is_installed_and_int8_the_cpu(
     assert engine.hardware == "cpu"
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

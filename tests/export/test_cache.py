@@ -354,7 +354,7 @@ def test_weights_of_one_network_have_one_graph(
     assert cached(weights)[1] == ""
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_changed_graph_changes_no_label(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the real export: the graph of another network of the same shape."""
     pytest.importorskip("onnxruntime")

@@ -33,7 +33,7 @@ from fixtures.commands import fails, refusal, run_cli  # noqa: E402
 from fixtures.s3_server import Bucket, slow_labels  # noqa: E402
 from fixtures.tiny import fresh_weights  # noqa: E402
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.full
 
 CLI = """
 import sys

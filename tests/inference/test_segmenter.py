@@ -588,7 +588,7 @@ print(1024 * int(status["VmHWM"].split()[0]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_a_point_of_a_large_scan_needs_few_bytes(tmp_path: Path) -> None:
     """Four tables of 19 scores and 15 neighbours alone are 364 bytes."""

@@ -294,7 +294,7 @@ def test_each_scan_is_read_only_in_its_turn(world: Path, monkeypatch: pytest.Mon
 # ---- the page of the documentation
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_every_command_of_the_page_runs_and_finds_most(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -159,9 +159,9 @@ def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
     ("stage", "launcher"),
     [
         ("rv", "launch"),
-        pytest.param("bev", "torchrun", marks=pytest.mark.slow),
+        pytest.param("bev", "torchrun", marks=pytest.mark.full),
         ("head", "srun"),
-        pytest.param("rv", "srun", marks=pytest.mark.slow),
+        pytest.param("rv", "srun", marks=pytest.mark.full),
     ],
 )
 def test_two_processes_train_the_weights_of_one(

@@ -790,7 +790,7 @@ def test_the_handler_of_sigterm_during_a_training_is_that_of_the_process(
     assert handlers["within"] == handlers["before"] != signal.SIG_DFL
 
 
-@pytest.mark.parametrize("room", [pytest.param(1_000, marks=pytest.mark.slow), 40_000])
+@pytest.mark.parametrize("room", [pytest.param(1_000, marks=pytest.mark.full), 40_000])
 def test_a_full_disk_stops_with_one_line_and_the_last_good_weights(
     world: Path, tmp_path: Path, room: int
 ) -> None:
