@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 import torch
+from torch import nn
 from torch.nn import functional as F
 
 from amvnet.config.nested import from_dict
@@ -25,6 +26,7 @@ from amvnet.training.loaders import ScanSet
 from amvnet.training.losses import Targets, dice, distillation_loss, lovasz_softmax, rival_classes
 from amvnet.training.networks import PolarStage, make_loaders, make_stage
 from amvnet.training.plan import Plan
+from amvnet.training.stage import Precision
 
 from fixtures.tiny import MODEL, street
 
@@ -101,6 +103,32 @@ def test_a_voxel_with_points_of_two_datasets_has_the_first_as_its_source() -> No
         )
     assert scored.source is not None
     assert dict(zip(scored.labels.tolist(), scored.source.tolist(), strict=True)) == {1: 1, 2: 2}
+
+
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+@pytest.mark.parametrize(
+    ("precision", "lower"), [("bf16-mixed", torch.bfloat16), ("16-mixed", torch.float16)]
+)
+def test_a_network_alone_computes_in_the_lower_precision(
+    stage: str, precision: Precision, lower: torch.dtype
+) -> None:
+    """What the network returns has the lower precision; what the loss compares is float32."""
+    view = replace(MODEL_CONFIG.range_view, hidden=0.5)
+    model = build_amvnet(replace(MODEL_CONFIG, range_view=view), 19)
+    plan = plan_with(CONFIG)
+    training = replace(plan.recipe.training, precision=precision)
+    made = make_stage(replace(plan, recipe=Recipe(training=training)), stage, model, None)
+    types: list[torch.dtype] = []
+
+    def note(net: nn.Module, inputs: Any, output: torch.Tensor) -> None:
+        types.append(output.dtype)
+
+    made.trained.register_forward_hook(note)
+    points, labels = batch_of_two()
+    scored = made.compare((points, labels, points.scan))
+    assert types == [lower]
+    assert scored.logits.dtype == made.loss(scored).dtype == torch.float32
+    assert made.score(points).dtype == torch.float32
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])

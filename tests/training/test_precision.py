@@ -1,11 +1,23 @@
-"""The precision that `auto` stands for."""
+"""The precision that `auto` stands for, and trainings in mixed precision on the CPU."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from amvnet.config.recipes import load_recipe
+from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.config.schema import TrainingConfig
+from amvnet.training.callbacks import KeepWeights
 from amvnet.training.stage import precision_of
+from amvnet.weights.file import PARTS, load, save
+
+from fixtures.commands import run_cli
+from fixtures.tiny import GOLDEN, fresh_weights, make_streets, write_recipe
+
+MIXED = ("bf16-mixed", "16-mixed")
+QUICK = {("finetune", "bf16-mixed"), ("semantickitti-compact", "16-mixed")}
 
 
 @pytest.mark.parametrize(
@@ -46,3 +58,55 @@ def test_a_named_precision_stays(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("recipe", ["simulated-compact", "semantickitti-compact", "finetune"])
 def test_the_recipes_for_small_machines_leave_it_to_the_device(recipe: str) -> None:
     assert load_recipe(recipe).training.precision == "auto"
+
+
+def recipes_in_mixed_precision() -> list[Any]:
+    cases = []
+    for recipe in recipe_names():
+        for precision in MIXED:
+            marks = () if (recipe, precision) in QUICK else pytest.mark.full
+            cases.append(pytest.param(recipe, precision, marks=marks))
+    return cases
+
+
+@pytest.mark.parametrize(("recipe", "precision"), recipes_in_mixed_precision())
+def test_each_stage_of_each_recipe_trains_and_resumes_in_mixed_precision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, precision: str
+) -> None:
+    """Each stage is interrupted once, in its second epoch, and so is resumed from a checkpoint."""
+    over = {"training": {"rv": {"epochs": 2}, "bev": {"epochs": 2}, "precision": precision}}
+    words: list[object] = ["train", write_recipe(tmp_path / "recipe.yaml", recipe, **over)]
+    words += ["--out", tmp_path / "run", "--data"]
+    if load_recipe(recipe).taxonomy == "semantickitti":
+        words += [make_streets(tmp_path / "data")]
+    else:
+        words += [GOLDEN / "nuscenes", "--train-sequences", "scene-0103"]
+        words += ["--val-sequences", "scene-0916"]
+    if recipe == "finetune":
+        start = fresh_weights()
+        view = replace(start.model.range_view, hidden=0.5)  # as the built-in weights have it
+        start = replace(start, model=replace(start.model, range_view=view))
+        save(start, tmp_path / "start.safetensors")
+        words += ["--init", tmp_path / "start.safetensors"]
+
+    stages = load_recipe(recipe).stages
+    interrupted: list[str] = []
+    keep = KeepWeights.on_train_epoch_end
+
+    def stop_once(self: KeepWeights, trainer: Any, stage: Any) -> None:
+        if trainer.current_epoch == 1 and stage.name not in interrupted:
+            interrupted.append(stage.name)
+            raise RuntimeError("the power is gone")
+        keep(self, trainer, stage)
+
+    monkeypatch.setattr(KeepWeights, "on_train_epoch_end", stop_once)
+    for _ in stages:
+        with pytest.raises(RuntimeError, match="power"):
+            run_cli(*words, "--resume")
+    assert run_cli(*words, "--resume") == (0, "")
+    assert interrupted == list(stages)
+
+    weights = load(tmp_path / "run")
+    assert weights.parts == PARTS
+    assert all(value.isfinite().all() for value in weights.tensors.values())
+    assert weights.training["range_net"]["precision"] == precision

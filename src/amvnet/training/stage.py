@@ -8,6 +8,7 @@ import math
 import pickle
 import signal
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -157,7 +158,10 @@ class Stage(L.LightningModule):
     def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
         """Advance the learning rate, but not while it is held at its peak."""
         if self.trainer.global_step not in self._held:
-            scheduler.step()
+            with warnings.catch_warnings():
+                # 16-mixed skips the first steps until its scale suits the gradients.
+                warnings.filterwarnings("ignore", "Detected call of `lr_scheduler.step")
+                scheduler.step()
 
     def empty_matrix(self) -> np.ndarray:
         """Return a (K + 1, K + 1) confusion matrix without counts."""

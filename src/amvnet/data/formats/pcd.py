@@ -10,6 +10,7 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
+import lzf
 import numpy as np
 
 from amvnet.data.formats.cloud import (
@@ -122,37 +123,14 @@ def _read_compressed(
     return arrays
 
 
-def unpack_lzf(data: bytes, size: int) -> bytearray:
-    """Unpack `size` bytes of LZF; raise ValueError or IndexError if the data are broken."""
-    output = bytearray()
-    position = 0
+def unpack_lzf(data: bytes, size: int) -> bytes:
+    """Unpack `size` bytes of LZF; raise ValueError if the data are broken.
 
-    while position < len(data) and len(output) <= size:
-        control = data[position]
-        position += 1
-
-        if control < 32:  # a literal: the next control + 1 bytes are copied
-            output += data[position : position + control + 1]
-            position += control + 1
-            continue
-
-        # A back reference has 3 bits of length and 13 bits of distance. If all 3 bits of the length
-        # are set, the next byte is added to the length.
-        length = (control >> 5) + 2
-        if length == 9:
-            length += data[position]
-            position += 1
-        distance = ((control & 31) << 8) + data[position] + 1
-        position += 1
-
-        start = len(output) - distance
-        if start < 0:
-            raise ValueError("a repetition of bytes before the first")
-        pattern = output[start : start + length]
-        if distance < length:  # the repetition repeats itself
-            pattern = (pattern * (length // distance + 1))[:length]
-        output += pattern
-
+    The library stops at `size` bytes and returns None if there are more.
+    """
+    output = lzf.decompress(data, size) if data else b""
+    if output is None:
+        raise ValueError(f"more than {size} unpacked bytes")
     if len(output) != size:
         raise ValueError(f"{len(output)} unpacked bytes instead of {size}")
     return output

@@ -37,8 +37,9 @@ except ImportError:  # Windows has no limits
 MEMORY = 700 << 20  # largest memory of the process for an empty file, bytes
 MEMORY_PER_BYTE = 10  # the additional memory for each byte of the file, bytes
 MAX_MEMORY = 4 << 30  # largest memory of the process for any file, bytes
-SECONDS = 5.0  # largest processor time for an empty file, seconds
-BYTES_PER_SECOND = 3e6  # the bytes of the file for which the process gets an additional second
+# The processor time is many times what the slowest good file takes on a fast processor.
+SECONDS = 60.0  # largest processor time for an empty file, seconds
+BYTES_PER_SECOND = 3e5  # the bytes of the file for which the process gets an additional second
 DISK = 64 << 20  # the largest temporary file for an empty file, bytes
 DISK_PER_BYTE = 20  # the additional size of a temporary file for each byte of the file, bytes
 
@@ -59,13 +60,15 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
         InputError: if the function raises it, or exceeds a limit.
     """
     global _process
+    size = size_of(path)
     request = {
         "module": function.__module__,
         "function": function.__name__,
         "path": str(path),
         "arguments": arguments,
         "folder": os.sep if path.is_absolute() else os.getcwd(),
-        "size": size_of(path),
+        "size": size,
+        "seconds": SECONDS + size / BYTES_PER_SECOND,
     }
 
     with _lock:
@@ -186,7 +189,7 @@ def serve() -> None:
     for line in sys.stdin.buffer:
         request = json.loads(line)
         os.chdir(request["folder"])  # the caller's folder may have changed
-        _set_limits(request["size"])
+        _set_limits(request["size"], request["seconds"])
 
         try:
             with reading(request["path"], "a file that can be read", ADVICE):
@@ -198,14 +201,14 @@ def serve() -> None:
         del values  # frees memory for the next file
 
 
-def _set_limits(size: int) -> None:
-    """Limit this process for a file of `size` bytes."""
+def _set_limits(size: int, seconds: float) -> None:
+    """Limit this process for a file of `size` bytes, and its processor time to `seconds` more."""
     if resource is None:
         return
     usage = resource.getrusage(resource.RUSAGE_SELF)
-    seconds = usage.ru_utime + usage.ru_stime + SECONDS + size / BYTES_PER_SECOND
+    used = usage.ru_utime + usage.ru_stime
     _limit(resource.RLIMIT_DATA, min(MEMORY + MEMORY_PER_BYTE * size, MAX_MEMORY))
-    _limit(resource.RLIMIT_CPU, math.ceil(seconds))
+    _limit(resource.RLIMIT_CPU, math.ceil(used + seconds))
     _limit(resource.RLIMIT_FSIZE, DISK + DISK_PER_BYTE * size)
 
 
