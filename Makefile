@@ -7,22 +7,19 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 # The least share of lines that `make test-full COVERAGE=1` must run, in percent: raise it to two points below what CI prints.
 COVERAGE_FLOOR := 90
 
-.PHONY: install demo test test-full quick-tests all-tests bench gpu docs lint format release clean
+.PHONY: install demo test test-full all-tests bench gpu docs style lint format release clean
 
 install: .venv/installed  ## the package and all that its tests need, in .venv
 
 demo: .venv/installed  ## simulate streets, segment and score them, and show all in demo/index.html
 	$(BIN)/amvnet demo --out demo --overwrite
 
-# Style and types are checked beside the tests, because mypy uses one processor for a minute. Each tool prints all that it found at once.
-test: .venv/installed  ## style, types and the tests of each change, in about 4 minutes on two cores
-	@$(MAKE) --no-print-directory --jobs=2 lint quick-tests
+test: style  ## style, and the tests of each change: about 4 minutes on two cores
+	$(PYTEST)
 
+# mypy uses one processor for a minute, so it runs beside the tests. Each tool prints all that it found at once.
 test-full: .venv/installed .venv/fleet  ## style, types and all tests, also of fleets, as CI runs them; COVERAGE=1 fails if they run too few lines
 	@$(MAKE) --no-print-directory --jobs=2 lint all-tests
-
-quick-tests: .venv/installed
-	$(PYTEST)
 
 all-tests: .venv/installed .venv/fleet
 	$(PYTEST) -m "full or not full" $(if $(COVERAGE),--cov=amvnet --cov=lidarstreets --cov-report=term:skip-covered --cov-fail-under=$(COVERAGE_FLOOR))
@@ -38,9 +35,11 @@ docs: .venv/docs docs/try/node_modules  ## the site of docs/, in site/
 	@echo "building the site of docs/ in site/: half a minute"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-lint: .venv/installed
+style: .venv/installed
 	$(BIN)/ruff check src ros2 docker tests benchmarks docs .ci
 	$(BIN)/ruff format --check src ros2 docker tests benchmarks docs/*.py .ci
+
+lint: style  ## style and types
 	$(BIN)/mypy
 
 format: .venv/installed

@@ -74,8 +74,9 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
 
         if error.filename == str(part):
             error.filename = str(path)
-        if error.filename is None:  # as in NumPy's error
-            raise OSError(error.errno or errno.EIO, str(error), str(path)) from None
+        if error.filename is None:  # an error of a write, or NumPy's error, which has no number
+            text = error.strerror or str(error)
+            raise OSError(error.errno or errno.EIO, text, str(path)) from None
         raise
     finally:
         with suppress(OSError):  # the file system may be read-only

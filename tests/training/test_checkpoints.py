@@ -1,0 +1,110 @@
+"""Checkpoints are whole, and a stage is trained by one call at a time."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from amvnet.files import alone_in
+from amvnet.training.stage import WholeCheckpoints
+
+from fixtures.commands import files, refusal, run_cli
+from fixtures.tiny import make_streets, write_recipe
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make streets, a recipe of one epoch, and a run of both networks."""
+    root = tmp_path_factory.mktemp("world")
+    make_streets(root / "data")
+    epochs = {"rv": {"epochs": 1}, "bev": {"epochs": 1}}
+    write_recipe(root / "recipe.yaml", training=epochs, stages=["rv", "bev"])
+    assert run_cli(*command(root, root / "run").split()) == (0, "")
+    return root
+
+
+def command(world: Path, out: Path) -> str:
+    return f"train {world}/recipe.yaml --data {world}/data --out {out}"
+
+
+def test_a_checkpoint_is_replaced_only_by_a_whole_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "last.ckpt"
+    WholeCheckpoints().save_checkpoint({"epoch": 0}, path)
+    write_bytes = Path.write_bytes
+
+    def write_half(self: Path, content: Any) -> int:
+        write_bytes(self, bytes(content)[: len(content) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", write_half)
+    with pytest.raises(OSError, match="No space") as caught:
+        WholeCheckpoints().save_checkpoint({"epoch": 1}, path)
+    assert (caught.value.filename, caught.value.strerror) == (str(path), "No space left on device")
+    assert torch.load(path, weights_only=True) == {"epoch": 0}
+    assert os.listdir(tmp_path) == ["last.ckpt"]
+
+
+def test_a_training_writes_nothing_into_the_temporary_folder_of_the_system(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That folder may be on another file system, or full."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    assert run_cli(*command(world, tmp_path / "run").split(), "--stage", "rv") == (0, "")
+
+
+@pytest.mark.parametrize("stage", ["rv", "all"])
+def test_a_stage_is_trained_by_one_call_at_a_time(world: Path, tmp_path: Path, stage: str) -> None:
+    """Another call that trains the stage changes nothing; the other network can be trained."""
+    out = tmp_path / "run"
+    assert run_cli(*command(world, out).split(), "--stage", "bev") == (0, "")
+    with alone_in(out, ".rv.lock"):
+        before = {name: (out / name).read_bytes() for name in files(out)}
+        words = f"--stage {stage} --resume --training.seed 2 --training.bev.epochs 1"
+        assert "another run" in refusal(f"{command(world, out)} {words}")
+        assert {name: (out / name).read_bytes() for name in files(out)} == before
+        assert run_cli(*command(world, out).split(), "--stage", "bev", "--resume") == (0, "")
+    assert run_cli(*command(world, out).split(), "--resume") == (0, "")
+    assert not [name for name in files(out) if "lock" in name]
+
+
+def test_a_run_that_cannot_begin_leaves_no_folder(world: Path, tmp_path: Path) -> None:
+    shutil.copytree(world / "data", tmp_path / "data")
+    (tmp_path / "data/sequences/00/labels/000000.label").write_bytes(b"1234")
+    train = f"train {world}/recipe.yaml --data {tmp_path}/data --out {tmp_path}/run"
+    assert "000000.label" in refusal(train)
+    assert not (tmp_path / "run").exists()
+
+
+def test_resume_removes_what_killed_runs_have_left_half_written(
+    world: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(world / "run", out)
+    half = f".{32 * '0'}.part"
+    for name in (f"{half}.yaml", f"rv/{half}.ckpt", f"bev/{half}.safetensors", "rv/.my.part"):
+        (out / name).write_bytes(b"half")
+
+    # The other network may be trained by another call, which has not finished its files.
+    assert run_cli(*command(world, out).split(), "--resume", "--stage", "rv") == (0, "")
+    assert not (out / f"rv/{half}.ckpt").exists()
+    assert (out / f"bev/{half}.safetensors").exists()
+    assert run_cli(*command(world, out).split(), "--resume") == (0, "")
+    assert files(out) == files(world / "run") | {"rv/.my.part"}
+
+
+def test_truncated_weights_of_a_finished_run_are_made_again(world: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(world / "run", out)
+    path = out / "weights.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+    assert run_cli(*command(world, out).split(), "--resume") == (0, "")
+    assert path.read_bytes() == (world / "run/weights.safetensors").read_bytes()
