@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from amvnet.engines import torch as torch_engine
 from amvnet.export import onnx as onnx_export
 from amvnet.scan import Scan
 
+from fixtures.commands import succeed
 from fixtures.exports import converting_once
 from fixtures.submissions import MAKERS, Case
+from fixtures.world import make_world, state_of
 
 LASERS = 16
 
@@ -57,6 +60,23 @@ def signal_handlers_are_kept() -> Iterator[None]:
     before = [signal.getsignal(number) for number in ending]
     yield
     assert [signal.getsignal(number) for number in ending] == before
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return the folder of `make_world`, which no test may change."""
+    root = make_world(tmp_path_factory.mktemp("world"))
+    before = state_of(root)
+    yield root
+    assert state_of(root) == before
+
+
+@pytest.fixture(scope="session")
+def predictions(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return labels and scores of the world's dataset by its weights, which no test may change."""
+    out = tmp_path_factory.mktemp("predictions")
+    succeed(f"predict {world}/data --weights {world}/w.safetensors --scores --out {out}")
+    return out
 
 
 @pytest.fixture

@@ -14,11 +14,11 @@ import pytest
 import amvnet
 from amvnet.cli.main import COMMANDS, main
 from amvnet.config.recipes import recipe_names
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
-from amvnet.weights.file import built_in, save
+from amvnet.weights.file import built_in
 
 from fixtures.commands import (
     files,
@@ -26,54 +26,24 @@ from fixtures.commands import (
     run_cli,
     succeed,
 )
-from fixtures.tiny import (
-    GOLDEN,
-    fresh_weights,
-    make_streets,
-    street,
-    without,
-    write_recipe,
-)
+from fixtures.tiny import GOLDEN
 
 OVERALL = {"miou", "miou_present", "accuracy", "fwiou", "iou"}
 RAW_IDS = set(SEMANTICKITTI.train_to_raw[1:])
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that no test may change: a dataset, weights, recipes, and good and bad scans."""
-    root = tmp_path_factory.mktemp("world")
-    _write_weights(root)
-    _write_scans(root)
-    _write_recipes(root)
-
-    make_streets(root / "data")
-    shutil.copytree(root / "data", root / "mislabelled")
-    labels = root / "mislabelled/sequences/08/labels/000001.label"
-    labels.write_bytes(labels.read_bytes()[:-4])
-    return root
-
-
-def _write_weights(root: Path) -> None:
-    weights = fresh_weights()
-    save(weights, root / "w.safetensors")
-    save(without(weights, "point_head"), root / "headless.safetensors")
-    save(fresh_weights(NUSCENES), root / "nuscenes.safetensors")
-
-
-def _write_scans(root: Path) -> None:
-    points, _ = street(7, 300)
-    points.tofile(root / "lone.bin")
-    (root / "empty.bin").write_bytes(b"")
-    (root / "truncated.bin").write_bytes((root / "lone.bin").read_bytes()[:-3])
-    np.full((5, 4), np.nan, np.float32).tofile(root / "nan.bin")
-
-
-def _write_recipes(root: Path) -> None:
-    write_recipe(root / "recipe.yaml")
+def wrong(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that no test may change: recipes that are wrong, and a dataset with wrong labels."""
+    root = tmp_path_factory.mktemp("wrong")
     (root / "latin1.yaml").write_bytes(b"taxonomy: \xff\xfe")
     (root / "loop.yaml").write_text(f"base: {root / 'loop.yaml'}")
     (root / "typo.yaml").write_text("base: semantickitti-compact\ntraining: {rv: {epoch: 3}}")
+
+    shutil.copytree(world / "data", root / "mislabelled")
+    labels = root / "mislabelled/sequences/08/labels/000001.label"
+    labels.write_bytes(labels.read_bytes()[:-4])
+    return root
 
 
 def read_json(path: Path) -> Any:
@@ -118,7 +88,7 @@ def test_an_existing_output_is_found_before_the_networks_are_loaded(
     assert "computing on" not in capsys.readouterr().out
 
 
-# {w} is the folder `world`, {out} a folder of the test.
+# {w} is the folder `world`, {wrong} the folder `wrong`, {out} a folder of the test.
 BENCH = "bench --weights {w}/w.safetensors --scan {w}/lone.bin"
 EVALUATE = "evaluate {w}/data --weights {w}/w.safetensors"
 PREDICT = "predict {w}/lone.bin --weights {w}/w.safetensors --out {out}"
@@ -163,14 +133,14 @@ MISTAKES = {
     "missing sequence to score": EVALUATE + " --sequences 05 --json {out}/m.json",
     "missing sequence to learn": TRAIN + " --train-sequences 05 --val-sequences 08",
     "wrong label count": (
-        "evaluate {w}/mislabelled --weights {w}/w.safetensors --json {out}/m.json"
+        "evaluate {wrong}/mislabelled --weights {w}/w.safetensors --json {out}/m.json"
     ),
     "training on validation data": TRAIN + " --train-sequences 00,08 --val-sequences 08",
     "head without networks": TRAIN_HEAD,
     "unknown recipe": "train best --data {w}/data --out {out}",
-    "unknown key in a recipe": "train {w}/typo.yaml --data {w}/data --out {out}",
-    "recipe that is no text": "train {w}/latin1.yaml --data {w}/data --out {out}",
-    "recipe based on itself": "train {w}/loop.yaml --data {w}/data --out {out}",
+    "unknown key in a recipe": "train {wrong}/typo.yaml --data {w}/data --out {out}",
+    "recipe that is no text": "train {wrong}/latin1.yaml --data {w}/data --out {out}",
+    "recipe based on itself": "train {wrong}/loop.yaml --data {w}/data --out {out}",
     "unknown key of a recipe": TRAIN + " --training.rv.colour red",
     "letters for a number": TRAIN + " --training.rv.epochs many",
     "no epochs": TRAIN_RV + " --training.rv.epochs 0",
@@ -200,17 +170,17 @@ RUN_FILES = {"out/recipe.yaml", "out/run.yaml", "out/class_counts.npz"}  # writt
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_one_line_and_leaves_nothing(
-    mistake: str, world: Path, tmp_path: Path
+    mistake: str, world: Path, wrong: Path, tmp_path: Path
 ) -> None:
     before = files(world)
-    line = refusal(MISTAKES[mistake].format(w=world, out=tmp_path / "out"))
+    line = refusal(MISTAKES[mistake].format(w=world, wrong=wrong, out=tmp_path / "out"))
     assert line.startswith("amvnet: ")
     assert files(world) == before
     assert files(tmp_path) <= RUN_FILES
 
 
-def test_a_run_with_wrong_labels_keeps_no_weights(world: Path, tmp_path: Path) -> None:
-    options = ("--data", world / "mislabelled", "--stage", "rv", "--out", tmp_path)
+def test_a_run_with_wrong_labels_keeps_no_weights(world: Path, wrong: Path, tmp_path: Path) -> None:
+    options = ("--data", wrong / "mislabelled", "--stage", "rv", "--out", tmp_path)
     code, error = run_cli("train", world / "recipe.yaml", *options)
     assert code == 2
     assert error.splitlines()[-1].startswith("amvnet: ")

@@ -17,9 +17,8 @@ from rich.table import Table
 from amvnet import progress
 from amvnet.cli import console
 from amvnet.progress import QUIET_SECONDS
-from amvnet.weights.file import save
 
-from fixtures.tiny import fresh_weights, street
+from fixtures.processes import PATIENCE
 
 PROGRESS_LINE = r"segmenting: (\d+) of \d+, .*, \d+:\d\d:\d\d left"
 
@@ -108,28 +107,27 @@ def amvnet(shell: str, **environment: str) -> tuple[int, str, str]:
     """Run a line of bash in which $AMVNET is the command; return its exit code and output."""
     command = {"AMVNET": f"{sys.executable} -m amvnet", **environment}
     done = subprocess.run(
-        ["bash", "-c", shell], env=os.environ | command, capture_output=True, text=True, timeout=120
+        ["bash", "-c", shell],
+        env=os.environ | command,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
     )
     return done.returncode, done.stdout, done.stderr
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights and three scans."""
-    root = tmp_path_factory.mktemp("world")
-    save(fresh_weights(), root / "w.safetensors")
-    (root / "scans").mkdir()
-    for name in "abc":
-        street(ord(name), 300)[0].tofile(root / f"scans/{name}.bin")
-    return root
+SINKS = ["| true", ">&-", "> /dev/full 2> /dev/full"]
 
 
-@pytest.mark.parametrize("sink", ["| true", "> /dev/full", ">&-", "> /dev/full 2> /dev/full"])
+# Each takes the seconds of an import of torch.
+@pytest.mark.parametrize(
+    "sink", ["> /dev/full", *(pytest.param(sink, marks=pytest.mark.full) for sink in SINKS)]
+)
 def test_the_work_goes_on_without_a_reader(sink: str, world: Path, tmp_path: Path) -> None:
-    command = f"$AMVNET predict {world}/scans --weights {world}/w.safetensors --out {tmp_path}"
+    command = f"$AMVNET predict {world}/lone.bin --weights {world}/w.safetensors --out {tmp_path}"
     code, _, error = amvnet(f"set -o pipefail; {command} {sink}")
     assert code == 0
-    assert {path.name for path in tmp_path.glob("*.label")} == {"a.label", "b.label", "c.label"}
+    assert {path.name for path in tmp_path.glob("*.label")} == {"lone.label"}
     expected = "stdout cannot be written" if sink == "> /dev/full" else ""
     assert error.count("\n") == bool(expected)
     assert expected in error
@@ -142,7 +140,7 @@ def test_what_only_speaks_does_not_fail_either(command: str) -> None:
     assert error.count("\n") == 1
 
 
-def test_letters_that_the_terminal_does_not_have_are_escaped(tmp_path: Path) -> None:
-    code, _, error = amvnet("$AMVNET info münchen.safetensors", PYTHONIOENCODING="ascii")
+def test_letters_that_the_terminal_does_not_have_are_escaped() -> None:
+    code, _, error = amvnet("$AMVNET münchen", PYTHONIOENCODING="ascii")
     assert code == 2
     assert "m\\xfcnchen" in error

@@ -8,25 +8,22 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
 from amvnet.cli import main as command_line
 from amvnet.cli.main import COMMANDS, CONTINUED_WHEN_REPEATED
+from amvnet.cli.stopping import SECONDS_TO_END
 from amvnet.errors import InputError, SomeBroken
 from amvnet.files import atomic_write, temporary_folder, unfinished
-from amvnet.weights.file import save
+from amvnet.inference.journal import Entry, Journal
 
-from fixtures.commands import run_cli
+from fixtures.commands import STOPPED, run_cli
+from fixtures.processes import PATIENCE, running, said_at_the_end
 from fixtures.scan_writers import some_points, write_las
-from fixtures.tiny import fresh_weights, street
-
-SOON = 5  # seconds on a busy machine; a second on an idle one
-SCANS = 24  # more than are labelled before a signal arrives
+from fixtures.world import SCANS
 
 Run = Callable[[str, Sequence[str]], None]
 
@@ -45,8 +42,7 @@ def signalled(number: int, becomes: type[BaseException] | None) -> Run:
 
     def run(command: str, arguments: Sequence[str]) -> None:
         try:
-            os.kill(os.getpid(), number)
-            time.sleep(60)
+            signal.raise_signal(number)
         except KeyboardInterrupt:
             if becomes is not None:
                 raise becomes from None
@@ -67,21 +63,25 @@ ENDS: dict[str, tuple[Run, int, str]] = {
 }
 
 
-@pytest.mark.parametrize("end", ENDS)
-@pytest.mark.parametrize("command", COMMANDS)
+# Each end of a command, and each command that a signal ends.
+CASES = [("predict", end) for end in ENDS]
+CASES += [(command, "SIGTERM") for command in COMMANDS if command != "predict"]
+
+
+@pytest.mark.parametrize(("command", "end"), CASES)
 def test_the_exit_code_of_every_command(
     command: str, end: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, code, words = ENDS[end]
     monkeypatch.setattr(command_line, "run", run)
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    actual, error = run_cli(command)
+    actual, error = run_cli(command, stops_itself=True)
 
     assert actual == code
     assert words in error
     assert error.count("\n") == (code != 0) + (code == 3)
     assert before == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    if code > 128:
+    if code > STOPPED:
         assert ("--resume" in error) == (
             "resume" in inspect.signature(COMMANDS[command]).parameters
         )
@@ -94,8 +94,8 @@ def test_the_page_has_all_exit_codes() -> None:
     assert {int(code) for code in codes} == {code for _, code, _ in ENDS.values()}
 
 
-# The commands below sleep for short times, because Python looks at a signal only after the sleep if
-# the signal comes just before the sleep begins.
+# The commands below sleep until a signal ends them. They sleep for short times, because Python
+# looks at a signal only after the sleep if the signal comes just before the sleep begins.
 STUBBORN = """
 import sys, time
 from amvnet.cli import main
@@ -117,33 +117,23 @@ sys.exit(main.main())
 """
 
 
-@contextmanager
-def running(script: str, environment: Mapping[str, str]) -> Iterator[subprocess.Popen[str]]:
-    """Run a script in a process of its own, and yield the process once it prints `ready`."""
-    with subprocess.Popen(
-        [sys.executable, "-c", script],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        yield process
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.full)]
+)
 def test_a_command_that_does_not_end_is_ended(number: int, tmp_path: Path) -> None:
     """It leaves no half file, and says one line."""
-    script = STUBBORN.replace("{path}", str(tmp_path / "a.txt"))
-    with running(script, os.environ) as process:
-        start = time.monotonic()
+    with running("-c", STUBBORN.replace("{path}", str(tmp_path / "a.txt"))) as process:
         process.send_signal(number)
-        assert process.wait(60) == 128 + number
-        assert time.monotonic() - start < SOON
-        assert process.stderr is not None
-        assert process.stderr.read() == "amvnet: stopped; go on with --resume\n"
+        assert said_at_the_end(process) == (
+            STOPPED + number,
+            "amvnet: stopped; go on with --resume\n",
+        )
     assert not list(tmp_path.iterdir())
+
+
+def test_a_command_has_less_than_a_second_to_end() -> None:
+    """After a third of the time, the processes that it may be waiting for are gone too."""
+    assert SECONDS_TO_END + SECONDS_TO_END / 3 < 1
 
 
 IMPORTING = """
@@ -168,12 +158,17 @@ sys.exit(main.main())
 """
 
 
+def run_script(script: str) -> tuple[int, str]:
+    """Run a script that ends by itself; return its exit code and what it says on stderr."""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE
+    )
+    return done.returncode, done.stderr
+
+
 def test_a_signal_during_an_import_raises_nothing_in_it() -> None:
     """Libraries in C++ abort at an exception then."""
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORTING], capture_output=True, text=True, timeout=60
-    )
-    assert (done.returncode, done.stderr) == (143, "amvnet: stopped\n")
+    assert run_script(IMPORTING) == (143, "amvnet: stopped\n")
 
 
 STARTING = """
@@ -196,10 +191,7 @@ sys.exit(main())
 
 def test_an_interrupted_start_has_no_traceback() -> None:
     """A process that a signal has ended has the exit code 130 in a shell."""
-    done = subprocess.run(
-        [sys.executable, "-c", STARTING], capture_output=True, text=True, timeout=60
-    )
-    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+    assert run_script(STARTING) == (-signal.SIGINT, "")
 
 
 WITH_SEMAPHORE = """
@@ -223,23 +215,17 @@ sys.exit(main.main())
 """
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("given", ["", "error::SyntaxWarning"])
 def test_semaphores_of_a_stopped_command_are_cleaned_up_in_silence(given: str) -> None:
     """Pools of processes have semaphores. Python's tracker of them would warn."""
-    with subprocess.Popen(
-        [sys.executable, "-c", WITH_SEMAPHORE],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONWARNINGS": given},
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert process.stdout.readline() == "ready\n"
+    environment = os.environ | {"PYTHONWARNINGS": given}
+    with running("-c", WITH_SEMAPHORE, environment=environment) as process:
         process.send_signal(signal.SIGTERM)
-        assert process.stderr.read() == "amvnet: stopped\n"
+        assert said_at_the_end(process) == (143, "amvnet: stopped\n")
 
 
+# The command waits for minutes only if the signal is lost.
 IN_DESTRUCTOR = """
 import os, signal, sys, time
 from amvnet.cli import main
@@ -250,7 +236,7 @@ class Signals:
 
 def run(command, arguments):
     Signals()
-    time.sleep(60)
+    time.sleep({patience})
 
 main.run = run
 sys.argv = ["amvnet", "info"]
@@ -258,43 +244,86 @@ sys.exit(main.main())
 """
 
 
+@pytest.mark.full
 def test_a_signal_during_a_destructor_ends_the_command_with_one_line() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", IN_DESTRUCTOR], capture_output=True, text=True, timeout=30
-    )
-    assert (done.returncode, done.stderr) == (143, "amvnet: stopped\n")
+    script = IN_DESTRUCTOR.replace("{patience}", str(PATIENCE))
+    assert run_script(script) == (143, "amvnet: stopped\n")
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights, scans that take seconds, and the labels of `predict`."""
-    root = tmp_path_factory.mktemp("world")
-    save(fresh_weights(), root / "w.safetensors")
-    (root / "scans").mkdir()
-    for index in range(SCANS):
-        street(index, 20_000)[0].tofile(root / f"scans/{index:02d}.bin")
-    arguments = ["predict", root / "scans", "--weights", root / "w.safetensors"]
-    assert run_cli(*arguments, "--out", root / "whole") == (0, "")
-    return root
+# ---- a run that goes on
+
+WRITTEN = 3  # scans that are labelled before the signal arrives
 
 
+def predict(world: Path, out: Path, *options: str) -> list[str]:
+    """Return the words of the command that labels the scans, one at a time."""
+    words = ["predict", world / "scans", "--weights", world / "w.safetensors", "--out", out]
+    return [*map(str, words), "--at-once", "1", *options]
+
+
+def check_it_goes_on(world: Path, folder: Path) -> None:
+    """Check that the run into `parts` has stopped half-way, and gives all labels if resumed."""
+    parts = folder / "parts"
+    assert WRITTEN <= len(list(parts.glob("*.label"))) < SCANS
+    assert not list(parts.glob(".*.part*"))
+    assert run_cli(*predict(world, parts, "--resume")) == (0, "")
+    assert run_cli(*predict(world, folder / "whole")) == (0, "")
+    for path in (folder / "whole").glob("*.label"):
+        assert path.read_bytes() == (parts / path.name).read_bytes()
+
+
+def test_a_stopped_predict_goes_on(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add = Journal.add
+    added: list[Entry] = []
+
+    def add_and_stop(journal: Journal, entry: Entry) -> None:
+        add(journal, entry)
+        added.append(entry)
+        if len(added) == WRITTEN:
+            signal.raise_signal(signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Journal, "add", add_and_stop)
+        stopped = run_cli(*predict(world, tmp_path / "parts"), stops_itself=True)
+    assert stopped == (143, "amvnet: stopped; go on with --resume\n")
+    check_it_goes_on(world, tmp_path)
+
+
+WAITING = """
+import sys, time
+from amvnet.__main__ import main
+from amvnet.inference.journal import Journal
+
+add = Journal.add
+added = []
+
+def add_and_wait(*arguments):
+    add(*arguments)
+    added.append(arguments)
+    if len(added) == {written}:
+        print("ready", flush=True)
+        while True:
+            time.sleep(0.1)
+
+Journal.add = add_and_wait
+sys.exit(main())
+"""
+
+
+@pytest.mark.full
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_predict_goes_on(number: int, world: Path, tmp_path: Path) -> None:
-    command = ["predict", world / "scans", "--weights", world / "w.safetensors", "--out"]
-    words = [sys.executable, "-m", "amvnet", *map(str, command), str(tmp_path / "parts")]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        while not list(tmp_path.glob("parts/[!.]*.label")) and process.poll() is None:
-            time.sleep(0.01)
+def test_a_process_that_is_stopped_goes_on(number: int, world: Path, tmp_path: Path) -> None:
+    script = WAITING.replace("{written}", str(WRITTEN))
+    words = predict(world, tmp_path / "parts")
+    with running("-c", script, *words) as process:
         process.send_signal(number)
-        assert process.wait(60) == 128 + number
-        assert process.stderr is not None
-        assert process.stderr.read() == "amvnet: stopped; go on with --resume\n"
-    assert 0 < len(list(tmp_path.glob("parts/*.label"))) < SCANS
-    assert not list(tmp_path.glob("parts/.*.part*"))
-
-    assert run_cli(*command, tmp_path / "parts", "--resume") == (0, "")
-    for path in (world / "whole").glob("*.label"):
-        assert path.read_bytes() == (tmp_path / "parts" / path.name).read_bytes()
+        assert said_at_the_end(process) == (
+            STOPPED + number,
+            "amvnet: stopped; go on with --resume\n",
+        )
+    check_it_goes_on(world, tmp_path)
 
 
 TEMPORARY = """
@@ -318,16 +347,17 @@ sys.exit(main.main())
 """
 
 
+@pytest.mark.full
 def test_a_stopped_command_leaves_no_temporary_folder(tmp_path: Path) -> None:
     write_las(tmp_path / "a.laz", some_points())
     (tmp_path / "temporary").mkdir()
     script = TEMPORARY.replace("{scan}", str(tmp_path / "a.laz"))
     script = script.replace("{out}", str(tmp_path / "out"))
     environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
-    with running(script, environment) as process:
+    with running("-c", script, environment=environment) as process:
         assert len(list((tmp_path / "temporary").iterdir())) == 1
         process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 143
+        assert said_at_the_end(process) == (143, "amvnet: stopped\n")
     assert not list((tmp_path / "temporary").iterdir())
     assert not list((tmp_path / "out").iterdir())
 
@@ -337,3 +367,38 @@ def test_finished_files_are_not_listed_as_unfinished(tmp_path: Path) -> None:
     with atomic_write(tmp_path / "a.txt") as part, temporary_folder() as folder:
         assert unfinished - before == {part, folder}
     assert unfinished == before
+
+
+# ---- pytest itself
+
+LONG = """
+from pathlib import Path
+import time
+
+from amvnet.cli import main
+from fixtures.commands import run_cli
+
+def wait(command, arguments):
+    print("\\nready", flush=True)
+    while True:
+        time.sleep(0.1)
+
+def test_a_long_command(monkeypatch):
+    monkeypatch.setattr(main, "run", wait)
+    run_cli("predict")
+
+def test_what_follows():
+    Path("{started}").touch()
+"""
+
+
+def test_a_signal_ends_pytest_also_while_a_command_runs_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "test_long.py"
+    path.write_text(LONG.replace("{started}", str(tmp_path / "started")))
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    words = ("-m", "pytest", "-s", "-p", "no:cacheprovider", path)
+    with running(*words, environment=environment) as process:
+        process.send_signal(signal.SIGTERM)
+        code, _ = said_at_the_end(process)
+    assert code != 0
+    assert not (tmp_path / "started").exists()
