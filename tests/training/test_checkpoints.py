@@ -61,7 +61,7 @@ def test_a_training_writes_nothing_into_the_temporary_folder_of_the_system(
     assert run_cli(*command(world, tmp_path / "run").split(), "--stage", "rv") == (0, "")
 
 
-@pytest.mark.parametrize("stage", ["rv", "all"])
+@pytest.mark.parametrize("stage", ["rv", pytest.param("all", marks=pytest.mark.full)])
 def test_a_stage_is_trained_by_one_call_at_a_time(world: Path, tmp_path: Path, stage: str) -> None:
     """Another call that trains the stage changes nothing; the other network can be trained."""
     out = tmp_path / "run"

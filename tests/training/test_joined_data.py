@@ -282,6 +282,7 @@ def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) ->
     assert torch.equal(view.rows(both)[~known], view.rows(replace(both, row=None))[~known])
 
 
+@pytest.mark.full
 def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought_to(
     tmp_path: Path,
 ) -> None:
@@ -354,6 +355,7 @@ def test_a_training_distils_what_one_of_its_datasets_lacks_and_says_so(
     assert (trained[0] != trained[1]).any()
 
 
+@pytest.mark.full
 def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
     world: Path, tmp_path: Path
 ) -> None:

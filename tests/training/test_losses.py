@@ -353,15 +353,10 @@ def test_if_every_point_is_ignored_loss_and_gradient_are_zero(
 
 
 @LOSSES
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_for_extreme_logits_the_loss_is_in_float32_and_its_gradient_finite(
-    region_loss: RegionLoss, dtype: torch.dtype
-) -> None:
+def test_for_extreme_logits_the_gradient_of_the_loss_is_finite(region_loss: RegionLoss) -> None:
     logits, labels = example()
-    logits = (logits * 1000).to(dtype).requires_grad_()
-    value = loss_of(region_loss, logits, labels.to(torch.uint8), None, 1.0)
-    value.backward()
-    assert value.dtype == torch.float32
+    logits = (logits * 1000).requires_grad_()
+    loss_of(region_loss, logits, labels.to(torch.uint8), None, 1.0).backward()
     assert logits.grad is not None
     assert logits.grad.isfinite().all()
 

@@ -17,7 +17,6 @@ from fixtures.commands import run_cli
 from fixtures.tiny import GOLDEN, fresh_weights, make_streets, write_recipe
 
 MIXED = ("bf16-mixed", "16-mixed")
-QUICK = {("finetune", "bf16-mixed"), ("semantickitti-compact", "16-mixed")}
 
 
 @pytest.mark.parametrize(
@@ -64,7 +63,8 @@ def recipes_in_mixed_precision() -> list[Any]:
     cases = []
     for recipe in recipe_names():
         for precision in MIXED:
-            marks = () if (recipe, precision) in QUICK else pytest.mark.full
+            is_quick = (recipe, precision) == ("finetune", "bf16-mixed")
+            marks = () if is_quick else pytest.mark.full
             cases.append(pytest.param(recipe, precision, marks=marks))
     return cases
 

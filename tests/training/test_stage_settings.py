@@ -114,8 +114,15 @@ def one_cycle(step: int, steps: int, peak: float, warmup: float, held: int = 0) 
     return cosine(peak, last, (step - top) / (steps - 1 - top))
 
 
-@pytest.mark.parametrize("accumulate", [1, 2])
-@pytest.mark.parametrize(("warmup", "hold", "held"), [(0.2, 0, 0), (0.5, 0, 0), (0.2, 0.5, 6)])
+@pytest.mark.parametrize("accumulate", [1, pytest.param(2, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    ("warmup", "hold", "held"),
+    [
+        pytest.param(0.2, 0, 0, marks=pytest.mark.full),
+        pytest.param(0.5, 0, 0, marks=pytest.mark.full),
+        (0.2, 0.5, 6),
+    ],
+)
 def test_the_learning_rate_of_a_whole_run_is_one_cycle(
     world: Path,
     tmp_path: Path,

@@ -5,13 +5,12 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
-from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY, SIMULATED_QUANTILES
 from amvnet.training import loaders, networks
 from amvnet.training import run as training_run
-from amvnet.training.callbacks import KeepWeights
+from amvnet.training.callbacks import KeepWeights, SeedBatches
 from amvnet.training.checking import check_data
 from amvnet.training.curves import Curves, draw_curves, read_curves
 from amvnet.training.head_points import PointGatherer
@@ -39,7 +38,7 @@ from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights, load, save
 
 from fixtures.commands import files, run_cli
-from fixtures.processes import Printed, start_cli
+from fixtures.processes import Printed, become_cli, fork_server, start_cli
 from fixtures.tiny import (
     BUILDING,
     CAR,
@@ -245,7 +244,7 @@ def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: P
     assert recipe["training"]["rv"]["epochs"] == 1
 
 
-@pytest.mark.parametrize("stage", ["rv", "bev"])
+@pytest.mark.parametrize("stage", [pytest.param("rv", marks=pytest.mark.full), "bev"])
 def test_a_network_learns_a_tiny_dataset_by_heart(world: Path, tmp_path: Path, stage: str) -> None:
     epochs = (f"--training.{stage}.epochs", 20)
     train(world, tmp_path / "run", "--stage", stage, *epochs, *NO_AUGMENTATION)
@@ -254,10 +253,12 @@ def test_a_network_learns_a_tiny_dataset_by_heart(world: Path, tmp_path: Path, s
     assert max(column(tmp_path / "run", stage, "val/acc")) > 0.6
 
 
+@pytest.mark.full
 def test_the_same_seed_gives_the_same_weights(world: Path, run: Path, tmp_path: Path) -> None:
     assert not differing(train(world, tmp_path / "again"), load(run))
 
 
+@pytest.mark.full
 def test_another_seed_gives_other_weights(world: Path, run: Path, tmp_path: Path) -> None:
     weights = train(world, tmp_path / "other", "--training.seed", 1)
     assert differing(weights, load(run)) == set(PARTS)
@@ -278,7 +279,15 @@ def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: 
             train(world, out, *options)
 
 
-@pytest.mark.parametrize(("stage", "epoch"), [("rv", 0), ("rv", 2), ("bev", 1), ("head", 1)])
+@pytest.mark.parametrize(
+    ("stage", "epoch"),
+    [
+        pytest.param("rv", 0, marks=pytest.mark.full),
+        pytest.param("rv", 2, marks=pytest.mark.full),
+        pytest.param("bev", 1, marks=pytest.mark.full),
+        ("head", 1),
+    ],
+)
 def test_an_interrupted_run_resumes_to_the_same_weights(
     world: Path, run: Path, tmp_path: Path, stage: str, epoch: int
 ) -> None:
@@ -290,6 +299,7 @@ def test_an_interrupted_run_resumes_to_the_same_weights(
         assert not differing(load(tmp_path / "run" / path), load(run / path))
 
 
+@pytest.mark.full
 def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
     world: Path, run: Path, tmp_path: Path
 ) -> None:
@@ -314,6 +324,7 @@ def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
     assert not differing(train(world, tmp_path / "cut", *options, "--resume"), whole)
 
 
+@pytest.mark.full
 def test_a_share_of_the_initial_weights_is_kept_and_resumes_to_the_bit(
     world: Path, run: Path, tmp_path: Path
 ) -> None:
@@ -347,6 +358,7 @@ def test_a_part_that_the_initial_weights_lack_is_missed_before_the_first_stage(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.full
 def test_a_run_is_not_resumed_from_other_initial_weights(world: Path, tmp_path: Path) -> None:
     command = [*train_arguments(world, tmp_path / "run"), "--stage", "rv", "--init"]
     for seed in (1, 2):
@@ -368,6 +380,7 @@ def test_no_initial_weights_to_keep_or_distil_is_one_line(
     assert "--init" in error
 
 
+@pytest.mark.full
 def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -422,6 +435,7 @@ def test_tuning_weights_of_matched_intensities_matches_the_other_scans_too(
     assert accuracy == pytest.approx(column(tmp_path / "run", "rv", "val/acc")[-1], abs=1e-4)
 
 
+@pytest.mark.full
 def test_reading_in_other_processes_changes_nothing_resumed_or_not(
     world: Path, run: Path, tmp_path: Path
 ) -> None:
@@ -436,6 +450,7 @@ def test_reading_in_other_processes_changes_nothing_resumed_or_not(
     assert not differing(resumed, load(run / "rv/last.safetensors"))
 
 
+@pytest.mark.full
 def test_a_resumed_run_keeps_the_curves_of_its_earlier_epochs(world: Path, tmp_path: Path) -> None:
     train_interrupted("rv", 2, world, tmp_path / "run", "--stage", "rv")
     train(world, tmp_path / "run", "--stage", "rv", "--resume")
@@ -525,6 +540,7 @@ def test_the_head_stage_leaves_the_networks_bitwise_unchanged(
     assert differing(before, after) == {"point_head"}
 
 
+@pytest.mark.full
 def test_a_head_may_learn_from_points_of_another_tau(
     world: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -554,12 +570,14 @@ def test_a_stage_takes_the_other_parts_from_init(world: Path, run: Path, tmp_pat
     assert after.training["polar_net"] == load(run).training["polar_net"]
 
 
+@pytest.mark.full
 def test_stages_one_by_one_equal_all_at_once(world: Path, run: Path, tmp_path: Path) -> None:
     for stage in PART_OF:
         weights = train(world, tmp_path / "run", "--stage", stage)
     assert not differing(weights, load(run))
 
 
+@pytest.mark.full
 def test_two_stages_trained_at_the_same_time_are_both_kept(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -583,6 +601,7 @@ def test_every_recipe_takes_the_last_epoch() -> None:
     assert {load_recipe(name).training.keep for name in recipe_names()} == {"last"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_an_incomplete_batch_of_parts_is_the_mean_of_its_scans(
     world: Path, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch
@@ -607,6 +626,7 @@ def test_an_incomplete_batch_of_parts_is_the_mean_of_its_scans(
     assert norms[3] == pytest.approx(norms[1], rel=1e-9)
 
 
+@pytest.mark.full
 def test_nuscenes_is_trained_predicted_and_evaluated(tmp_path: Path) -> None:
     recipe = write_recipe(tmp_path / "recipe.yaml", "nuscenes-compact")
     data = GOLDEN / "nuscenes"
@@ -629,6 +649,7 @@ def test_nuscenes_is_trained_predicted_and_evaluated(tmp_path: Path) -> None:
     assert run_cli("evaluate", data, "--weights", run, *scene)[0] == 0
 
 
+@pytest.mark.full
 def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -659,6 +680,7 @@ def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
     assert best.metrics["point_head"]["epoch"] == np.argmax(own)
 
 
+@pytest.mark.full
 def test_a_new_head_is_trained_on_the_networks_of_weights_with_another_one(
     world: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -675,6 +697,7 @@ def test_a_new_head_is_trained_on_the_networks_of_weights_with_another_one(
     assert "point_head.fc" in fail(*arguments, "--model.point_head.fc", 16)
 
 
+@pytest.mark.full
 def test_the_networks_of_a_head_keep_their_settings_and_the_run_says_so(
     world: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -713,6 +736,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(
     assert not (out / "weights.safetensors").exists()
 
 
+@pytest.mark.full
 def test_a_run_of_several_calls_records_what_each_trained_on(world: Path, tmp_path: Path) -> None:
     val = ("--val-sequences", "08")
     train(world, tmp_path, "--stage", "rv", "--train-sequences", "00", *val)
@@ -727,16 +751,34 @@ def test_a_run_of_several_calls_records_what_each_trained_on(world: Path, tmp_pa
     assert records["rv"]["versions"]["torch"] == torch.__version__
 
 
-def start_training(world: Path, out: Path, stage: str) -> tuple[ForkServerProcess, Printed]:
-    """Start the training of a stage in a process of its own; return it after the first epoch."""
+def train_until_signal(words: list[str], printed: Printed, number: int) -> None:
+    """Train in this process, which gets a signal at the beginning of the second epoch."""
+
+    def signalled(self: SeedBatches, trainer: Any, *_: object) -> None:
+        if trainer.current_epoch == 1:
+            os.kill(os.getpid(), number)
+
+    SeedBatches.on_train_batch_start = signalled  # type: ignore[method-assign]
+    become_cli(words, printed)
+
+
+def train_with_signal(
+    world: Path, out: Path, stage: str, number: int
+) -> tuple[int | None, Printed]:
+    """Train in a process of its own, which gets a signal after the first epoch.
+
+    Returns:
+        Its exit code, and what it has printed.
+    """
     printed = Printed(out.with_name(f"printed by {out.name}"))
     words = [*map(str, train_arguments(world, out)), "--stage", stage]
-    process = start_cli(words, printed)
-    while not (out / stage / "last.ckpt").exists() and process.is_alive():
-        time.sleep(0.002)
-    return process, printed
+    process = fork_server().Process(target=train_until_signal, args=(words, printed, number))
+    process.start()
+    process.join()
+    return process.exitcode, printed
 
 
+@pytest.mark.full
 @STAGES
 def test_a_killed_run_resumes_to_the_same_weights(
     world: Path, run: Path, tmp_path: Path, stage: str
@@ -746,24 +788,19 @@ def test_a_killed_run_resumes_to_the_same_weights(
         for earlier in ("rv", "bev"):
             shutil.copytree(run / earlier, out / earlier)
 
-    process, _ = start_training(world, out, stage)
-    process.kill()
-    process.join()
-    assert not (out / stage / "done").exists(), "the run was over before it was killed"
-
+    assert train_with_signal(world, out, stage, signal.SIGKILL)[0] == -signal.SIGKILL
     train(world, out, "--stage", stage, "--resume")
     weights = load(out / stage / "last.safetensors")
     assert not differing(weights, load(run / stage / "last.safetensors"))
 
 
+@pytest.mark.full
 def test_sigterm_ends_a_training_with_143_and_one_line_and_resume_goes_on(
     world: Path, run: Path, tmp_path: Path
 ) -> None:
     """Lightning has a handler of its own, under which the training would end as if it were done."""
-    process, printed = start_training(world, tmp_path / "run", "rv")
-    process.terminate()
-    process.join()
-    assert process.exitcode == 143, printed.text
+    code, printed = train_with_signal(world, tmp_path / "run", "rv", signal.SIGTERM)
+    assert code == 143, printed.text
     assert printed.stderr.read_text() == "amvnet: stopped; go on with --resume\n"
     assert "weights in" not in printed.stdout.read_text()
 
@@ -790,6 +827,7 @@ def test_the_handler_of_sigterm_during_a_training_is_that_of_the_process(
     assert handlers["within"] == handlers["before"] != signal.SIG_DFL
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("room", [pytest.param(1_000, marks=pytest.mark.full), 40_000])
 def test_a_full_disk_stops_with_one_line_and_the_last_good_weights(
     world: Path, tmp_path: Path, room: int
@@ -811,6 +849,7 @@ def test_a_full_disk_stops_with_one_line_and_the_last_good_weights(
     train(world, out, "--stage", "rv", "--resume")
 
 
+@pytest.mark.full
 def test_a_run_that_fails_prints_one_line_and_keeps_the_stages_before(
     world: Path, tmp_path: Path
 ) -> None:
@@ -831,6 +870,7 @@ def test_a_run_that_fails_prints_one_line_and_keeps_the_stages_before(
     assert load(tmp_path / "run").parts == ("range_net",)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("stage", ["bev", "rv"])
 def test_a_baseline_is_trained_and_evaluated_alone(world: Path, tmp_path: Path, stage: str) -> None:
     recipe = write_recipe(tmp_path / "recipe.yaml", "semantickitti-compact")
@@ -847,6 +887,7 @@ def test_a_baseline_is_trained_and_evaluated_alone(world: Path, tmp_path: Path, 
     assert list(json.loads(results.read_text())["methods"]) == [stage]
 
 
+@pytest.mark.full
 def test_the_validation_scans_can_be_learnt_too(world: Path, tmp_path: Path) -> None:
     """For an entry to a benchmark: there is no validation, and the last weights are the best."""
     run = tmp_path / "run"
@@ -892,6 +933,7 @@ def test_the_share_of_uncertain_points_is_that_of_the_networks(
     assert column(run, "head", "val/uncertain")[0] == pytest.approx(share, abs=0.02)
 
 
+@pytest.mark.full
 def test_networks_with_few_channels_train_without_a_crash() -> None:
     """PyTorch 2.13 corrupts the heap in the backward pass of some strided 1 x 1 convolutions.
 
