@@ -9,6 +9,7 @@ import torch
 
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.config.schema import TrainingConfig
+from amvnet.runtime.distributed import device_of
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.stage import precision_of
 from amvnet.weights.file import PARTS, load, save
@@ -46,6 +47,13 @@ def test_a_gpu_is_asked_without_emulation(
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", is_bf16_supported)
     expected = "bf16-mixed" if includes_bfloat16 else "32-true"
     assert precision_of(TrainingConfig(precision="auto", accelerator="gpu")) == expected
+
+
+def test_a_mac_trains_on_its_gpu_in_32_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    assert [device_of(name) for name in ("auto", "gpu", "cpu")] == ["mps", "mps", "cpu"]
+    assert precision_of(TrainingConfig(precision="auto", accelerator="gpu")) == "32-true"
 
 
 def test_a_named_precision_stays(monkeypatch: pytest.MonkeyPatch) -> None:
