@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import laspy
+import lzf
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,7 @@ from pypcd4 import Encoding, PointCloud
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
+from amvnet.data.formats import reader_process
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.cloud import MAX_POINTS
 from amvnet.data.formats.find import find_scans, list_scans, read_cloud, scan_stem
@@ -203,8 +205,6 @@ def test_ascii_is_read_with_any_white_space_and_nan(tmp_path: Path) -> None:
 
 
 def test_compressed_columns_of_several_values_are_read_as_pcl_writes_them(tmp_path: Path) -> None:
-    import lzf
-
     points = some_points()
     normals = np.arange(180, dtype=np.float32)  # three per point, before x
     data = normals.tobytes() + points.T.tobytes()
@@ -219,8 +219,6 @@ def test_compressed_columns_of_several_values_are_read_as_pcl_writes_them(tmp_pa
 
 
 def test_the_first_value_of_a_column_of_several_is_used(tmp_path: Path) -> None:
-    import lzf
-
     points = some_points()
     path = tmp_path / "a.pcd"
     header = "FIELDS normal x y z intensity\nSIZE 4 4 4 4 4\nTYPE F F F F F\nCOUNT 3 2 1 1 1\n"
@@ -242,16 +240,27 @@ def test_the_first_value_of_a_column_of_several_is_used(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_scan(path).points, points)
 
 
-def test_lzf_is_unpacked_as_by_its_own_library() -> None:
-    import lzf
-
+def test_lzf_is_unpacked_if_it_has_the_size_that_is_stated() -> None:
     rng = np.random.default_rng(0)
     repetitions = b"".join(rng.bytes(5) * k for k in range(2, 60))
     for data in (bytes(1000), b"ab" * 500, rng.bytes(300), repetitions):
         packed = lzf.compress(data, 2 * len(data) + 100)
         assert unpack_lzf(packed, len(data)) == data
-        with pytest.raises((ValueError, IndexError)):
-            unpack_lzf(packed, len(data) - 1)
+        for size in (0, len(data) - 1, len(data) + 1):
+            with pytest.raises(ValueError, match="unpacked bytes"):
+                unpack_lzf(packed, size)
+    assert unpack_lzf(b"", 0) == b""
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"\x05ab", b"\x20\x00", b"\x00a\x20\x01", b"\x00a\x20", b"\x00a\xe0\x05"],
+    ids=["literal cut off", "nothing to repeat", "before the first", "no distance", "no end"],
+)
+def test_broken_lzf_is_an_error_of_one_line(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.pcd"
+    path.write_bytes(_pcd(1, "binary_compressed", struct.pack("<II", len(data), 12) + data))
+    fails(partial(read_scan, path), path, "expected a PCD file, found a broken file", "write")
 
 
 # --- other variants ---
@@ -649,7 +658,6 @@ def test_headers_that_claim_billions_are_refused_before_memory_is_taken(
         "a.npy": _npy((MANY, 4)),
         "b.npy": _npy((MANY, MANY, MANY)),
         "points.las": _las(folder / "old.las", "<I", 107, MANY),
-        "records.las": _las(folder / "old.las", "<I", 100, MANY),
         "points_of_1.4.las": _las(folder / "new.las", "<Q", 247, 1 << 60),
         "a.laz": _las(folder / "packed.laz", "<I", 107, MANY),
         "b.laz": _las(folder / "packed.laz", "<I", 107, MAX_POINTS),
@@ -663,6 +671,16 @@ def test_headers_that_claim_billions_are_refused_before_memory_is_taken(
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert peak < 20e6, (name, peak)
+
+
+@pytest.mark.full
+def test_a_file_that_claims_billions_of_records_is_refused_for_the_time_it_takes(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader_process, "SECONDS", 1.0)
+    path = tmp_path / "records.las"
+    path.write_bytes(_las(folder / "old.las", "<I", 100, MANY))
+    fails(partial(read_scan, path), path, "takes too long")
 
 
 def test_broken_compressed_files_give_an_error_of_one_line(

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,6 +21,7 @@ from amvnet.data.formats.find import list_scans
 
 from fixtures.commands import fails
 from fixtures.scan_writers import some_points, write_bag2, write_las
+from fixtures.waiting import wait_for_end
 
 CLOUDS = [some_points(60, seed) for seed in range(6)]
 
@@ -60,7 +60,9 @@ def test_relative_paths_are_those_of_this_process(
         assert len(read_scan("scan.las")) == 40 + len(list(tmp_path.iterdir()))
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGXCPU])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGKILL, marks=pytest.mark.full), signal.SIGXCPU]
+)
 def test_a_file_that_ends_the_process_does_not_end_the_next(
     bag: Path, number: signal.Signals
 ) -> None:
@@ -92,7 +94,7 @@ def test_an_interruption_does_not_mix_up_replies(
     np.testing.assert_array_equal(second.read().to_scan().points, CLOUDS[1])
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.full)])
 def test_scans_are_read_by_worker_processes_too(bag: Path, method: str) -> None:
     scans = list(list_scans(bag))
     scans[0].read()
@@ -107,30 +109,32 @@ def _read(scan: object) -> np.ndarray:
     return scan.read().to_scan().points  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("ends", ["by itself", "by SIGKILL"])
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's descriptors of processes")
+@pytest.mark.parametrize("ends", ["by itself", pytest.param("by SIGKILL", marks=pytest.mark.full)])
 def test_the_process_ends_with_the_one_that_started_it(tmp_path: Path, ends: str) -> None:
     path = write_las(tmp_path / "a.las", some_points())
     code = (
-        "import sys, time\n"
+        "import sys\n"
         "from amvnet.data.formats import reader_process\n"
         "from amvnet.data.formats.find import read_cloud\n"
         "read_cloud(sys.argv[1])\n"
         "print(reader_process._process._popen.pid, reader_process._process._folder, flush=True)\n"
+        "sys.stdin.read()\n"
     )
-    if ends == "by SIGKILL":
-        code += "time.sleep(60)\n"
     with subprocess.Popen(
-        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as parent:
+        assert parent.stdin is not None
         assert parent.stdout is not None
         number, folder = parent.stdout.readline().split()
         if ends == "by SIGKILL":
             parent.kill()
+        else:
+            parent.stdin.close()
 
-    for _ in range(100):
-        if not Path(f"/proc/{number}").exists():
-            break
-        time.sleep(0.1)
-    assert not Path(f"/proc/{number}").exists()
+    wait_for_end(int(number))
     if ends == "by itself":
         assert not Path(folder).exists()
