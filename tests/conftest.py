@@ -15,7 +15,6 @@ from amvnet.engines import torch as torch_engine
 from amvnet.export import onnx as onnx_export
 from amvnet.scan import Scan
 
-from fixtures.commands import succeed
 from fixtures.exports import converting_once
 from fixtures.submissions import MAKERS, Case
 from fixtures.world import make_world, state_of
@@ -69,14 +68,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     before = state_of(root)
     yield root
     assert state_of(root) == before
-
-
-@pytest.fixture(scope="session")
-def predictions(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return labels and scores of the world's dataset by its weights, which no test may change."""
-    out = tmp_path_factory.mktemp("predictions")
-    succeed(f"predict {world}/data --weights {world}/w.safetensors --scores --out {out}")
-    return out
 
 
 @pytest.fixture

@@ -16,7 +16,6 @@ import pytest
 from amvnet.inference.journal import JOURNAL, UNFINISHED
 from amvnet.onnx_runner import DESCRIPTION
 from amvnet.outputs import Signature, check_outputs
-from amvnet.weights.file import save
 
 from fixtures.commands import (
     fails,
@@ -25,23 +24,10 @@ from fixtures.commands import (
     run_cli,
     succeed,
 )
-from fixtures.tiny import fresh_weights, make_streets, street
+from fixtures.marks import with_full
 
 MINE = b"hours of work"
 ANYTHING = Signature("a file", b"")
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset, lone scans, weights and predictions of the dataset with scores."""
-    root = tmp_path_factory.mktemp("world")
-    make_streets(root / "data", ("00", "08"))
-    save(fresh_weights(), root / "w.safetensors")
-    (root / "scans").mkdir()
-    for name in ("a", "b"):
-        street(ord(name), 300)[0].tofile(root / f"scans/{name}.bin")
-    succeed(f"predict {root}/data --weights {root}/w.safetensors --scores --out {root}/predictions")
-    return root
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -82,7 +68,7 @@ class Case:
 
 WEIGHTS = "--weights {world}/w.safetensors"
 SCORES = "--scores-a {world}/predictions --scores-b {world}/predictions"
-SCANS = f"predict {{world}}/scans {WEIGHTS} --out {{out}}"
+SCANS = f"predict {{world}}/pair {WEIGHTS} --out {{out}}"
 LABELS = bytes(8)
 CASES = {
     "predict": Case(SCANS, "b.label", LABELS),
@@ -126,13 +112,15 @@ CASES = {
         PNG,
     ),
     "bench": Case(
-        f"bench {WEIGHTS} --runs 1 --scan {{world}}/scans/a.bin --json {{out}}/b.json",
+        f"bench {WEIGHTS} --runs 1 --scan {{world}}/pair/a.bin --json {{out}}/b.json",
         "b.json",
         b'{"engine": "torch"}',
     ),
     "analyze": Case(f"analyze {{world}}/data {WEIGHTS} --out {{out}}", "tau.png", PNG),
     "table": Case(f"analyze {{world}}/data {WEIGHTS} --out {{out}}", "tau.csv", b"tau,mIoU %\n"),
 }
+SLOW = ("pictures", "analyze", "table")  # they draw
+ALIKE = ("npy", "ply", "scores", "uncertain", "dataset")  # they are like `predict`
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -154,7 +142,7 @@ def test_a_users_file_stays_and_nothing_is_written(name: str, world: Path, tmp_p
     assert files(tmp_path) == {case.file}
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", with_full(CASES, SLOW))
 def test_an_earlier_file_of_the_same_kind_is_replaced_if_the_user_says_so(
     name: str, world: Path, tmp_path: Path
 ) -> None:
@@ -166,7 +154,7 @@ def test_an_earlier_file_of_the_same_kind_is_replaced_if_the_user_says_so(
     assert earlier.read_bytes() != case.earlier
 
 
-@pytest.mark.parametrize("name", sorted(set(CASES) - {"bench", "table"}))
+@pytest.mark.parametrize("name", with_full(sorted(set(CASES) - {"bench", "table"}), SLOW + ALIKE))
 def test_a_command_repeats_itself_only_if_told_to(name: str, world: Path, tmp_path: Path) -> None:
     case = CASES[name]
     command = case.text(world, tmp_path)
@@ -179,8 +167,8 @@ def test_a_command_repeats_itself_only_if_told_to(name: str, world: Path, tmp_pa
 
 # Commands whose output {link} is a link to an input; the name of the input in the world.
 READ = {
-    "scan": (f"{SCANS} --overwrite", "b.label", "scans/b.bin"),
-    "scan as scores": (f"{SCANS} --scores --overwrite", "b.npz", "scans/b.bin"),
+    "scan": (f"{SCANS} --overwrite", "b.label", "pair/b.bin"),
+    "scan as scores": (f"{SCANS} --scores --overwrite", "b.npz", "pair/b.bin"),
     "weights": (f"{SCANS} --overwrite", "b.label", "w.safetensors"),
     "true labels": (
         f"predict {{world}}/data {WEIGHTS} --out {{out}} --overwrite",
@@ -192,9 +180,9 @@ READ = {
         "sequences/08/predictions/000000.label",
         "predictions/sequences/08/predictions/000001.npz",
     ),
-    "view": ("view {world}/scans/a.bin --html {out}/p.html --overwrite", "p.html", "scans/a.bin"),
+    "view": ("view {world}/pair/a.bin --html {out}/p.html --overwrite", "p.html", "pair/a.bin"),
     "labels": (
-        "view {world}/scans/a.bin --labels {world}/a.label --html {out}/p.html --overwrite",
+        "view {world}/pair/a.bin --labels {world}/a.label --html {out}/p.html --overwrite",
         "p.html",
         "a.label",
     ),
@@ -202,7 +190,7 @@ READ = {
     "export": (f"export {WEIGHTS} --out {{out}}", "range_net.onnx", "w.safetensors"),
     "evaluate": (f"evaluate {{world}}/data {WEIGHTS} --json {{out}}/m", "m", "w.safetensors"),
     "analyze": (f"analyze {{world}}/data {WEIGHTS} --out {{out}}", "tau.csv", "w.safetensors"),
-    "bench": ("bench --scan {world}/scans/a.bin --json {out}/b", "b", "scans/a.bin"),
+    "bench": ("bench --scan {world}/pair/a.bin --json {out}/b", "b", "pair/a.bin"),
     "train": (
         "train semantickitti-compact --data {world}/data --out {out} --init {world}/w.safetensors",
         "weights.safetensors",
@@ -217,7 +205,6 @@ def test_no_output_is_an_input(name: str, is_hard: bool, world: Path, tmp_path: 
     command, output, read = READ[name]
     link = tmp_path / output
     link.parent.mkdir(parents=True, exist_ok=True)
-    (world / "a.label").write_bytes(bytes(1200))
     if is_hard:
         os.link(world / read, link)
     else:
@@ -238,7 +225,7 @@ def test_the_users_labels_are_not_replaced_by_those_of_other_classes(
     """Labels of other classes are not read. They are inputs all the same."""
     scan = tmp_path / "scans/a.bin"
     scan.parent.mkdir()
-    shutil.copy(world / "scans/a.bin", scan)
+    shutil.copy(world / "pair/a.bin", scan)
     own = scan.parent / labels.replace("{name}", "a") if "/" in labels else scan.with_suffix(labels)
     own.parent.mkdir(exist_ok=True)
     own.resolve().write_bytes(LABELS)
@@ -256,11 +243,11 @@ def test_the_users_labels_are_not_replaced_by_those_of_other_classes(
 
 
 def test_a_scan_is_not_replaced_by_its_page(world: Path, tmp_path: Path) -> None:
-    scan = shutil.copy(world / "scans/a.bin", tmp_path)
+    scan = shutil.copy(world / "pair/a.bin", tmp_path)
     command = f"view {scan} {WEIGHTS} --html {scan}".format(world=world)
     for option in ("", " --overwrite"):
         assert "found the input" in refusal(command + option)
-    assert contents(tmp_path) == {"a.bin": (world / "scans/a.bin").read_bytes()}
+    assert contents(tmp_path) == {"a.bin": (world / "pair/a.bin").read_bytes()}
 
 
 def test_a_labelled_scan_is_not_replaced_by_labels_from_another_folder(
@@ -347,7 +334,7 @@ def test_export_replaces_its_graphs_if_told_to(world: Path, tmp_path: Path) -> N
 
 def test_labels_in_the_folder_of_the_scans_stay(world: Path, tmp_path: Path) -> None:
     """`predict mylab --out mylab` is refused if there are labels already, and else is not."""
-    shutil.copytree(world / "scans", tmp_path, dirs_exist_ok=True)
+    shutil.copytree(world / "pair", tmp_path, dirs_exist_ok=True)
     (tmp_path / "a.label").write_bytes(MINE)
     command = f"predict {tmp_path} --weights {world}/w.safetensors --out {tmp_path}"
     assert "a.label" in refusal(command)
@@ -359,7 +346,7 @@ def test_labels_in_the_folder_of_the_scans_stay(world: Path, tmp_path: Path) -> 
 
 def test_two_runs_share_a_folder_if_their_scans_differ(world: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        scan = f"{world}/scans/{name}.bin"
+        scan = f"{world}/pair/{name}.bin"
         succeed(f"predict {scan} --weights {world}/w.safetensors --out {tmp_path}")
     assert files(tmp_path) == {"a.label", "b.label"}
 
@@ -385,14 +372,14 @@ def test_resuming_keeps_corrected_labels_and_a_users_own(world: Path, tmp_path: 
     """Labels of a finished run may be corrected; those of a scan that is new are the user's."""
     scans = tmp_path / "scans"
     scans.mkdir()
-    shutil.copy(world / "scans/a.bin", scans)
+    shutil.copy(world / "pair/a.bin", scans)
     out = tmp_path / "out"
     command = f"predict {scans} --weights {world}/w.safetensors --out {out} --resume"
     succeed(command)
     (out / "a.label").write_bytes(MINE)  # corrected
     succeed(command)
 
-    shutil.copy(world / "scans/b.bin", scans)
+    shutil.copy(world / "pair/b.bin", scans)
     (out / "b.label").write_bytes(MINE)
     assert "b.label" in refusal(command)
     assert {(out / name).read_bytes() for name in files(out)} == {MINE}
@@ -402,7 +389,7 @@ def test_the_labels_of_a_broken_scan_stay_the_users(world: Path, tmp_path: Path)
     """`--overwrite` replaces only labels of scans that could be read."""
     out = tmp_path / "out"
     out.mkdir()
-    shutil.copytree(world / "scans", tmp_path / "scans")
+    shutil.copytree(world / "pair", tmp_path / "scans")
     (tmp_path / "scans/b.bin").write_bytes(b"truncated")
     (out / "b.label").write_bytes(LABELS)
     command = f"predict {tmp_path}/scans --weights {world}/w.safetensors --out {out}"

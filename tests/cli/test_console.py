@@ -18,6 +18,7 @@ from amvnet import progress
 from amvnet.cli import console
 from amvnet.progress import QUIET_SECONDS
 
+from fixtures.marks import with_quick
 from fixtures.processes import PATIENCE
 
 PROGRESS_LINE = r"segmenting: (\d+) of \d+, .*, \d+:\d\d:\d\d left"
@@ -116,13 +117,11 @@ def amvnet(shell: str, **environment: str) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
-SINKS = ["| true", ">&-", "> /dev/full 2> /dev/full"]
+SINKS = ("> /dev/full", "| true", ">&-", "> /dev/full 2> /dev/full")
 
 
 # Each takes the seconds of an import of torch.
-@pytest.mark.parametrize(
-    "sink", ["> /dev/full", *(pytest.param(sink, marks=pytest.mark.full) for sink in SINKS)]
-)
+@pytest.mark.parametrize("sink", with_quick(SINKS, ["> /dev/full"]))
 def test_the_work_goes_on_without_a_reader(sink: str, world: Path, tmp_path: Path) -> None:
     command = f"$AMVNET predict {world}/lone.bin --weights {world}/w.safetensors --out {tmp_path}"
     code, _, error = amvnet(f"set -o pipefail; {command} {sink}")

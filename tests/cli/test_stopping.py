@@ -21,6 +21,7 @@ from amvnet.files import atomic_write, temporary_folder, unfinished
 from amvnet.inference.journal import Entry, Journal
 
 from fixtures.commands import STOPPED, run_cli
+from fixtures.marks import with_full
 from fixtures.processes import PATIENCE, running, said_at_the_end
 from fixtures.scan_writers import some_points, write_las
 from fixtures.world import SCANS
@@ -117,9 +118,7 @@ sys.exit(main.main())
 """
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.full)]
-)
+@pytest.mark.parametrize("number", with_full([signal.SIGTERM, signal.SIGINT], [signal.SIGINT]))
 def test_a_command_that_does_not_end_is_ended(number: int, tmp_path: Path) -> None:
     """It leaves no half file, and says one line."""
     with running("-c", STUBBORN.replace("{path}", str(tmp_path / "a.txt"))) as process:
