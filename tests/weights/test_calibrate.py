@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,25 +19,17 @@ from amvnet.weights.file import load, save
 from fixtures.commands import fails
 from fixtures.tiny import fresh_weights, without
 
-WEIGHTS = "sim-hdl64e"
-
-
-def calibrated(tmp_path: Path, counts: np.ndarray, prior: float, bev: float) -> Path:
-    """Return the file of the calibrated weights."""
-    weights = calibrate(load(WEIGHTS), counts, prior, bev)
-    return save(weights, tmp_path / "calibrated.safetensors")
+WEIGHTS = fresh_weights()
 
 
 def test_the_ensemble_weighs_the_networks_and_their_labels_stay(
-    tmp_path: Path, random_scan: Callable[..., Scan]
+    random_scan: Callable[..., Scan],
 ) -> None:
     # The scores of hidden points are means, which do not commute with a factor of the logits.
-    model = load(WEIGHTS).model
-    model = replace(model, range_view=replace(model.range_view, hidden=0.0))
-    weights = replace(load(WEIGHTS), model=model)
+    assert WEIGHTS.model.range_view.hidden == 0
     scan = random_scan(2000)
-    before = amvnet.load(weights, method="ensemble")(scan)
-    after = amvnet.load(calibrate(weights, np.ones(19), 0, 0.7), method="ensemble")(scan)
+    before = amvnet.load(WEIGHTS, method="ensemble")(scan)
+    after = amvnet.load(calibrate(WEIGHTS, np.ones(19), 0, 0.7), method="ensemble")(scan)
     assert before.rv is not None
     assert before.bev is not None
     assert after.rv is not None
@@ -64,7 +55,8 @@ def test_rare_classes_are_named_less_often(
     counts = np.full(19, 1e6)
     counts[rare] = 1e3
 
-    path = calibrated(tmp_path, counts, prior=0.5, bev=0.5)
+    calibrated = calibrate(WEIGHTS, counts, prior=0.5, bev=0.5)
+    path = save(calibrated, tmp_path / "calibrated.safetensors")
     after = amvnet.load(path, method="rv")(scan).labels
     assert (after == rare + 1).sum() < 0.9 * named[rare]
 
