@@ -30,6 +30,7 @@ from amvnet.weights.file import save
 from amvnet_ros.segmentation import CloudSegmenter, Settings
 
 from fixtures.commands import fails, succeed
+from fixtures.marks import with_quick
 from fixtures.scan_writers import cloud_message
 from fixtures.tiny import (
     fresh_weights,
@@ -100,7 +101,6 @@ class World:
 
     folder: Path
     weights: Path
-    graphs: Path
 
     @cached_property
     def segmenter(self) -> Segmenter:
@@ -219,15 +219,19 @@ OF_DATASETS = (by_predict_of_a_dataset, by_evaluate_of_a_dataset)
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> World:
+def saved(tmp_path_factory: pytest.TempPathFactory) -> World:
+    folder = tmp_path_factory.mktemp("entries")
+    return World(folder, save(WEIGHTS, folder / "tiny.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def runner(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> OnnxSegmenter:
+    """One network as a graph, which is enough: all graphs get the same points."""
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library)
-
-    folder = tmp_path_factory.mktemp("entries")
-    save(WEIGHTS, folder / "tiny.safetensors")
-    # One network is enough: all graphs get the same points.
-    export(without(WEIGHTS, "polar_net", "point_head"), folder / "graphs")
-    return World(folder, folder / "tiny.safetensors", folder / "graphs")
+    folder = tmp_path_factory.mktemp("graphs")
+    export(without(WEIGHTS, "polar_net", "point_head"), folder)
+    return OnnxSegmenter(folder)
 
 
 @contextmanager
@@ -238,17 +242,16 @@ def no_warnings() -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("name", SCANS)
+QUICK = ("plain", "all kinds of lost returns", "without intensities", "in double precision")
+
+
+@pytest.mark.parametrize("name", with_quick(SCANS, QUICK))
 def test_every_entry_gives_a_scan_the_same_labels(saved: World, name: str) -> None:
     points = SCANS[name]()
     with no_warnings():
         expected = saved.segmenter(points).labels
-        by_rv = amvnet.load(WEIGHTS, method="rv")(points).labels
     lost = expected == 0
-    table = points.astype(np.float32)
-    is_lost = ~np.isfinite(table).all(axis=1) | (table[:, :3] == 0).all(axis=1)
-    is_lost |= (np.abs(table[:, :3]) > 1e4).any(axis=1)
-    np.testing.assert_array_equal(lost, is_lost)
+    np.testing.assert_array_equal(lost, is_lost(points))
 
     entries = [*IN_MEMORY, *OF_FILES]
     if points.shape[1] == 4:
@@ -260,19 +263,43 @@ def test_every_entry_gives_a_scan_the_same_labels(saved: World, name: str) -> No
         # Batches and other orders of sums may round otherwise.
         assert (labels == expected).mean() > 0.995, entry.__name__
 
-    if points.shape[1] == 4:
-        actual = OnnxSegmenter(saved.graphs)(points).labels
-        np.testing.assert_array_equal(actual == 0, lost)
-        assert (actual == by_rv).mean() > 0.995
+
+def is_lost(points: np.ndarray) -> np.ndarray:
+    """Return which points of a scan are lost returns."""
+    table = points.astype(np.float32)
+    lost = ~np.isfinite(table).all(axis=1) | (table[:, :3] == 0).all(axis=1)
+    return lost | (np.abs(table[:, :3]) > 1e4).any(axis=1)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", [name for name in SCANS if name != "without intensities"])
+def test_the_onnx_runner_gives_a_scan_the_same_labels(runner: OnnxSegmenter, name: str) -> None:
+    points = SCANS[name]()
+    labels = runner(points).labels
+    np.testing.assert_array_equal(labels == 0, is_lost(points))
+    expected = amvnet.load(WEIGHTS, method="rv")(points).labels
+    assert (labels == expected).mean() > 0.995
+
+
+OF_8_BITS = ("intensities in [0, 1]", "to 255", "divide")
+OF_LOST_RETURNS = ("-1 in 300 of 1,500 points", "write 0")
+
+
+def with_intensities_of_8_bits() -> np.ndarray:
+    return plain() * np.array([1, 1, 1, 255], np.float32)
+
+
+def with_negative_intensities() -> np.ndarray:
+    points = plain()
+    points[1:301, 3] = -1
+    return points
 
 
 def test_entries_that_do_not_normalise_refuse_intensities_of_8_bits(saved: World) -> None:
-    points = plain() * np.array([1, 1, 1, 255], np.float32)
-    words = ("intensities in [0, 1]", "to 255", "divide")
-    for call in (saved.segmenter, OnnxSegmenter(saved.graphs)):
-        fails(partial(call, points), *words)
+    points = with_intensities_of_8_bits()
+    fails(partial(saved.segmenter, points), *OF_8_BITS)
     for entry in (*IN_MEMORY, by_evaluate_of_a_dataset):
-        fails(partial(entry, saved, points), *words)
+        fails(partial(entry, saved, points), *OF_8_BITS)
 
     expected = saved.segmenter(plain()).labels
     for entry in OF_FILES:
@@ -280,10 +307,7 @@ def test_entries_that_do_not_normalise_refuse_intensities_of_8_bits(saved: World
 
 
 def test_negative_intensities_are_named_with_their_number(saved: World) -> None:
-    points = plain()
-    points[1:301, 3] = -1
-    for call in (saved.segmenter, OnnxSegmenter(saved.graphs)):
-        fails(partial(call, points), "-1 in 300 of 1,500 points", "write 0")
+    fails(partial(saved.segmenter, with_negative_intensities()), *OF_LOST_RETURNS)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -296,10 +320,24 @@ def test_intensities_that_are_all_lost_are_none(saved: World, value: float) -> N
             assert np.array_equal(entry(saved, points), expected), entry.__name__
 
 
-@pytest.mark.parametrize("name", [name for name in LOST if "intensity" not in name])
+OF_PLACES = [name for name in LOST if "intensity" not in name]
+
+
+def of_lost_returns(name: str) -> np.ndarray:
+    return np.array([LOST[name]] * 100, np.float32)
+
+
+@pytest.mark.parametrize("name", OF_PLACES)
 def test_a_scan_of_lost_returns_alone_is_refused_by_every_entry(saved: World, name: str) -> None:
-    points = np.array([LOST[name]] * 100, np.float32)
-    for call in (saved.segmenter, OnnxSegmenter(saved.graphs)):
-        fails(partial(call, points), "expected points to segment")
+    points = of_lost_returns(name)
+    fails(partial(saved.segmenter, points), "expected points to segment")
     for entry in (by_scan, by_path, by_evaluate, by_node, by_evaluate_of_a_dataset):
         fails(partial(entry, saved, points), "expected")
+
+
+@pytest.mark.full
+def test_the_onnx_runner_refuses_what_the_segmenter_refuses(runner: OnnxSegmenter) -> None:
+    fails(partial(runner, with_intensities_of_8_bits()), *OF_8_BITS)
+    fails(partial(runner, with_negative_intensities()), *OF_LOST_RETURNS)
+    for name in OF_PLACES:
+        fails(partial(runner, of_lost_returns(name)), "expected points to segment")

@@ -17,11 +17,9 @@ from amvnet.cli.options import FormatName
 from amvnet.data.formats.find import read_cloud
 from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.weights.file import save
 
 from fixtures.commands import fails, files, run_cli
 from fixtures.scan_writers import some_points, write_bag1, write_pcd
-from fixtures.tiny import fresh_weights, make_streets
 
 COUNT = 60
 LOST = 7  # the index of a point with NaN
@@ -204,12 +202,9 @@ def test_an_unknown_format_is_named() -> None:
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with weights, a dataset, and single scans of three formats."""
-    root = tmp_path_factory.mktemp("world")
-    make_streets(root / "data")
-    save(fresh_weights(), root / "w.safetensors")
-
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with single scans of three formats, two of them in `scans`."""
+    root = tmp_path_factory.mktemp("recorded")
     points = some_points(400)
     (root / "scans").mkdir()
     points.tofile(root / "scans/a.bin")
@@ -236,14 +231,14 @@ def failure(world: Path, out: Path, *words: object) -> str:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_predict_writes_the_points_of_the_file_though_the_network_gets_others(
-    kind: str, world: Path, tmp_path: Path
+    kind: str, world: Path, recorded: Path, tmp_path: Path
 ) -> None:
-    inputs = (world / "scans", world / "drive.bag", "--axes", "y-forward", "--height", "0.5")
+    inputs = (recorded / "scans", recorded / "drive.bag", "--axes", "y-forward", "--height", "0.5")
     assert predict(world, tmp_path / "label", *inputs)[0] == 0
     assert predict(world, tmp_path / "out", *inputs, "--format", kind)[0] == 0
 
-    first = read_cloud(world / "scans/a.bin").xyz
-    second = read_cloud(world / "scans/b.pcd").xyz
+    first = read_cloud(recorded / "scans/a.bin").xyz
+    second = read_cloud(recorded / "scans/b.pcd").xyz
     scans = {"a": first, "b": second, "drive/000000": second, "drive/000001": second[::-1]}
     assert files(tmp_path / "out") == {f"{name}.{kind}" for name in scans}
 
@@ -256,9 +251,11 @@ def test_predict_writes_the_points_of_the_file_though_the_network_gets_others(
             check_coordinates(content.xyz, xyz)
 
 
-def test_uncertain_points_are_those_of_the_segmenter(world: Path, tmp_path: Path) -> None:
+def test_uncertain_points_are_those_of_the_segmenter(
+    world: Path, recorded: Path, tmp_path: Path
+) -> None:
     options = ("--uncertain", "--sequences", "08", "--format", "ply")
-    assert predict(world, tmp_path, world / "data", world / "scans", *options)[0] == 0
+    assert predict(world, tmp_path, world / "data", recorded / "scans", *options)[0] == 0
 
     # A dataset keeps its layout and its format.
     folder = "sequences/08/predictions"
@@ -285,10 +282,10 @@ def test_uncertain_points_are_those_of_the_segmenter(world: Path, tmp_path: Path
 
 
 def test_one_network_alone_reports_no_uncertain_points(world: Path, tmp_path: Path) -> None:
-    scan = world / "scans/a.bin"
+    scan = world / "lone.bin"
     options = ("--method", "rv", "--format", "ply")
     assert predict(world, tmp_path, scan, *options)[0] == 0
-    assert read_ply(tmp_path / "a.ply").uncertain is None
+    assert read_ply(tmp_path / "lone.ply").uncertain is None
 
     message = failure(world, tmp_path / "other", scan, *options, "--uncertain")
     assert "--uncertain" in message
@@ -322,7 +319,7 @@ def test_uncertain_points_next_to_scans_are_not_scans(world: Path, tmp_path: Pat
 
 
 def test_an_unknown_format_gives_an_error_of_one_line(world: Path, tmp_path: Path) -> None:
-    message = failure(world, tmp_path, world / "scans/a.bin", "--format", "xyz")
+    message = failure(world, tmp_path, world / "lone.bin", "--format", "xyz")
     assert "ply" in message
 
 

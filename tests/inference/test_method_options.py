@@ -14,14 +14,8 @@ from amvnet.config.schema import AssertionConfig
 from amvnet.weights.file import save
 
 from fixtures.commands import refusal, succeed
-from fixtures.tiny import (
-    fresh_weights,
-    make_streets,
-    street,
-    write_scan,
-)
+from fixtures.tiny import fresh_weights, make_streets
 
-POINTS = street(5, 600)[0]
 FRESH = fresh_weights()
 # About half of the points are certain.
 WEIGHTS = replace(FRESH, model=replace(FRESH.model, assertion=AssertionConfig(threshold=0.7)))
@@ -29,9 +23,9 @@ WEIGHTS = replace(FRESH, model=replace(FRESH.model, assertion=AssertionConfig(th
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of one sequence, and weights."""
     root = make_streets(tmp_path_factory.mktemp("world"), sequences=("08",))
     save(WEIGHTS, root / "w.safetensors")
-    write_scan(root / "lone", "00", "000000", POINTS, None)
     return root
 
 

@@ -24,20 +24,11 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.ranking.label_errors import rank
 from amvnet.runtime.memory import available_memory
 from amvnet.viewing.shown_scans import show_scans
-from amvnet.weights.file import save
 
 from fixtures.commands import refusal, run_cli
-from fixtures.tiny import fresh_weights, make_streets
-
-WAIT = 30  # seconds until a thread gives up waiting for another
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("streets")
-    make_streets(root)
-    save(fresh_weights(), root / "w.safetensors")
-    return root
+from fixtures.marks import with_full
+from fixtures.processes import PATIENCE
+from fixtures.tiny import fresh_weights
 
 
 @pytest.mark.parametrize("at_once", [1, 3])
@@ -48,7 +39,7 @@ def test_results_come_in_order(at_once: int) -> None:
 
 def test_scans_are_computed_at_the_same_time() -> None:
     barrier = threading.Barrier(2)
-    results = stream_scans(range(4), str, lambda n, scan: barrier.wait(WAIT), at_once=2)
+    results = stream_scans(range(4), str, lambda n, scan: barrier.wait(PATIENCE), at_once=2)
     assert sorted(results) == [0, 0, 1, 1]
 
 
@@ -86,7 +77,7 @@ def test_scans_at_the_same_time_share_the_threads(
 
     def compute(n: int, scan: str) -> int:
         if n < together:
-            barrier.wait(WAIT)  # breaks unless so many are computed at the same time
+            barrier.wait(PATIENCE)  # breaks unless so many are computed at the same time
         return torch.get_num_threads()
 
     torch.set_num_threads(threads)
@@ -156,23 +147,25 @@ def _viewed(dataset: Dataset, segmenter: Segmenter) -> Any:
     return [[each.name, each.labels["amvnet"].tolist()] for each in shown]
 
 
-@pytest.mark.parametrize("command", [_evaluated, _analyzed, _ranked, _viewed])
+@pytest.mark.parametrize(
+    "command", with_full([_evaluated, _analyzed, _ranked, _viewed], [_analyzed])
+)
 def test_any_number_of_scans_at_a_time_gives_the_same_result(
-    command: Callable[[Dataset, Segmenter], Any], data: Path
+    command: Callable[[Dataset, Segmenter], Any], world: Path
 ) -> None:
     results = []
     for at_once in (1, 3):
-        segmenter = amvnet.load(data / "w.safetensors")
+        segmenter = amvnet.load(world / "w.safetensors")
         segmenter.at_once = at_once
-        results.append(command(open_dataset(str(data)), segmenter))
+        results.append(command(open_dataset(str(world / "data")), segmenter))
     np.testing.assert_equal(*results)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "analyze", "rank", "view"])
+@pytest.mark.parametrize("command", with_full(["evaluate", "analyze", "rank", "view"], ["analyze"]))
 def test_every_command_takes_the_options_of_predict(
-    command: str, data: Path, tmp_path: Path
+    command: str, world: Path, tmp_path: Path
 ) -> None:
-    words = [command, str(data), "--weights", str(data / "w.safetensors")]
+    words = [command, str(world / "data"), "--weights", str(world / "w.safetensors")]
     words += {
         "evaluate": [],
         "analyze": ["--out", str(tmp_path)],

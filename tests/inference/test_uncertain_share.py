@@ -14,12 +14,7 @@ from amvnet.inference.segmentation import Verdict, uncertain_share
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 
 from fixtures.commands import run_cli
-from fixtures.tiny import (
-    fresh_weights,
-    make_streets,
-    street,
-    without,
-)
+from fixtures.tiny import fresh_weights, street, without
 
 POINTS = street(5, 400)[0]
 
@@ -110,41 +105,36 @@ def test_the_share_is_that_of_the_valid_points() -> None:
 # ---- the command
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_streets(tmp_path_factory.mktemp("data"), ("00",))
-
-
-def said(data: Path, out: Path, weights: Weights, capsys: Any, *options: str) -> str:
-    """Segment a dataset; return what is printed."""
+def said(world: Path, out: Path, weights: Weights, capsys: Any, *options: str) -> str:
+    """Segment a sequence of the dataset; return what is printed."""
     path = save(weights, out / "w.safetensors")
-    words = ("predict", data, "--weights", path, "--out", out / "labels", *options)
-    assert run_cli(*words) == (0, "")
+    words = ("predict", world / "data", "--weights", path, "--out", out / "labels", *options)
+    assert run_cli(*words, "--sequences", "00") == (0, "")
     return str(capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("at_once", ["1", "2"])
 def test_predict_says_the_share_of_the_run(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], at_once: str
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], at_once: str
 ) -> None:
     weights = with_usual(1.0)
     segmenter = amvnet.load(weights)
     uncertain = [segmenter(street(scan)[0]).uncertain for scan in range(2)]
     verdict = Verdict(float(np.concatenate(uncertain).mean()), 1.0)
 
-    text = said(data, tmp_path, weights, capsys, "--at-once", at_once)
+    text = said(world, tmp_path, weights, capsys, "--at-once", at_once)
     assert str(verdict) in text
     assert "warning" not in text
 
 
 def test_predict_warns_and_says_what_to_try(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     weights = with_usual(0.0)
     everywhere = replace(weights.model.assertion, threshold=1.0)
     weights = replace(weights, model=replace(weights.model, assertion=everywhere))
 
-    text = said(data, tmp_path, weights, capsys)
+    text = said(world, tmp_path, weights, capsys)
     (warning,) = [line for line in text.splitlines() if line.startswith("warning: ")]
     assert "100.0%" in warning
     for word in ("--height", "--axes", "--intensity-scale", "weights of another sensor"):
@@ -164,7 +154,7 @@ def test_predict_warns_even_if_some_scans_are_broken(
 
 
 def test_predict_by_one_network_says_nothing_of_it(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     weights = without(fresh_weights(), "polar_net", "point_head")
-    assert "uncertain" not in said(data, tmp_path, weights, capsys, "--method", "rv")
+    assert "uncertain" not in said(world, tmp_path, weights, capsys, "--method", "rv")
