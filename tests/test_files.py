@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amvnet import files
@@ -38,6 +37,7 @@ from lidarstreets.layouts import write_whole
 
 from fixtures.commands import fails, refusal, run_cli
 from fixtures.datasets import MAKERS, make_nuscenes
+from fixtures.examples import with_examples
 from fixtures.surroundings import LINKS, NAMES, PRECIOUS, REFUSED, contents_outside, surroundings
 from fixtures.tiny import fresh_weights, make_simulation_quick, street, without, write_recipe
 
@@ -95,8 +95,7 @@ def with_token(token: str) -> Callable[[Path], None]:
 # ---- nothing outside the output folder
 
 
-@settings(deadline=None, max_examples=150)
-@given(name=NAMES, kind=st.sampled_from(["label", "npy", "ply"]), link=LINKS)
+@with_examples(150, name=NAMES, kind=st.sampled_from(["label", "npy", "ply"]), link=LINKS)
 def test_names_of_scans_write_nothing_elsewhere(name: str, kind: str, link: str) -> None:
     with surroundings(link) as base:
         name = name.replace("BASE", str(base))
@@ -108,8 +107,7 @@ def test_names_of_scans_write_nothing_elsewhere(name: str, kind: str, link: str)
             scan.write_labels(base / "out", scan.load(), result, kind, NUSCENES)
 
 
-@settings(deadline=None, max_examples=100)
-@given(token=NAMES, link=LINKS, is_mapped=st.booleans())
+@with_examples(100, token=NAMES, link=LINKS, is_mapped=st.booleans())
 def test_tokens_write_nothing_elsewhere(token: str, link: str, is_mapped: bool) -> None:
     with surroundings(link, make=with_token(token)) as base, suppress(InputError):
         dataset = open_dataset(f"nuscenes:{base}/data")
@@ -120,8 +118,7 @@ def test_tokens_write_nothing_elsewhere(token: str, link: str, is_mapped: bool) 
         write(base, scans)
 
 
-@settings(deadline=None, max_examples=100)
-@given(name=NAMES, link=LINKS, layout=st.sampled_from(list(MAKERS)))
+@with_examples(100, name=NAMES, link=LINKS, layout=st.sampled_from(list(MAKERS)))
 def test_records_write_nothing_elsewhere(name: str, link: str, layout: str) -> None:
     with surroundings(link, make=MAKERS[layout]) as base:
         dataset = open_dataset(f"{layout}:{base}/data")
@@ -136,8 +133,8 @@ ENDINGS = st.sampled_from(["label", "npy", "ply", "npz", "uncertain.npy"])
 FILES = st.builds("{}.{}".format, st.sampled_from(["a", "b", "c/a"]), ENDINGS)
 
 
-@settings(deadline=None, max_examples=60)
-@given(
+@with_examples(
+    60,
     kind=st.sampled_from(["label", "npy", "ply"]),
     inputs=st.lists(FILES, min_size=1, max_size=3, unique=True),
     links=st.dictionaries(FILES, FILES, max_size=3),
@@ -224,12 +221,22 @@ COMMANDS = (
 )
 
 
+def each_of(commands: Sequence[str], *slow: str) -> list[Any]:
+    """Return commands as parameters of tests; the slow ones are marked full."""
+    parameters = []
+    for command in commands:
+        name = command.split()[0]
+        marks = [pytest.mark.full] if name in slow else []
+        parameters.append(pytest.param(command, marks=marks, id=name))
+    return parameters
+
+
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(fresh_weights(NUSCENES), tmp_path_factory.mktemp("weights") / "w.safetensors")
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split()[0])
+@pytest.mark.parametrize("command", each_of(COMMANDS, "train"))
 def test_every_command_refuses_a_token_that_is_a_path(command: str, weights: Path) -> None:
     with surroundings(make=with_token("../../../victim/precious")) as base:
         line = refusal(command.format(base=base, weights=weights))
@@ -288,7 +295,7 @@ def make_hostile(folder: Path) -> None:
     (folder / "temporary").mkdir()
 
 
-@pytest.mark.parametrize("command", WRITERS, ids=lambda command: command.split()[0])
+@pytest.mark.parametrize("command", each_of(WRITERS, "export", "train", "evaluate"))
 def test_names_in_the_data_do_not_lead_a_command_elsewhere(
     command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -310,7 +317,7 @@ def test_names_in_the_data_do_not_lead_a_command_elsewhere(
         assert (code == 0) == bool(succeeded), error
 
 
-@pytest.mark.parametrize("command", COMMANDS[:2], ids=lambda command: command.split()[0])
+@pytest.mark.parametrize("command", each_of(COMMANDS[:2]))
 def test_a_linked_folder_of_the_output_is_refused(command: str, weights: Path) -> None:
     with surroundings("lidarseg", make=with_token("precious")) as base:
         for token in ("precious", "scene-0103-8", "scene-0061-9", "scene-0061-8"):

@@ -20,6 +20,7 @@ from fixtures.sensors import LASERS, place
 from fixtures.tiny import fresh_weights
 
 UP = ["z-down", "z-forward", "y-up"]
+WEIGHTS = replace(fresh_weights(), sensor="hdl64e")
 
 
 def scan_xyz(height: float = 1.73, seed: int = 0) -> np.ndarray:
@@ -38,9 +39,8 @@ def tilted(xyz: np.ndarray, pitch: float, roll: float) -> np.ndarray:
 def normalise(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]:
     """Return the normalised scan, and what was said."""
     lines: list[str] = []
-    weights = replace(fresh_weights(), sensor="hdl64e")
     intensity = np.linspace(0, 0.6, len(xyz))
-    scan = normaliser_for(weights, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")
+    scan = normaliser_for(WEIGHTS, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")
     return scan, lines[0]
 
 
@@ -156,8 +156,7 @@ def test_a_raised_road_is_not_upside_down() -> None:
 
 @pytest.mark.parametrize("tilt", [(8, 0), (0, 8)])
 def test_scans_that_sway_are_levelled_one_by_one(tilt: tuple[float, float]) -> None:
-    weights = replace(fresh_weights(), sensor="hdl64e")
-    normaliser = normaliser_for(weights)
+    normaliser = normaliser_for(WEIGHTS)
     pitch, roll = tilt
     for seed, side in enumerate((1, -1, 1, -1, 1, -1, 1)):
         xyz = scan_xyz(seed=seed)

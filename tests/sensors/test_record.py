@@ -43,7 +43,10 @@ def trained_at(height: float, root: Path) -> Weights:
     return replace(weights, sensor="hdl64e", training=training)
 
 
-@pytest.mark.parametrize("height", [0.8, 1.73, 2.6])
+@pytest.mark.parametrize(
+    "height",
+    [0.8, pytest.param(1.73, marks=pytest.mark.full), pytest.param(2.6, marks=pytest.mark.full)],
+)
 def test_datasets_folders_files_and_bags_get_the_same_labels(height: float, tmp_path: Path) -> None:
     weights = trained_at(height, tmp_path / "data")
     save(weights, tmp_path / "w.safetensors")

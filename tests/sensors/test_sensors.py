@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import amvnet
@@ -40,11 +39,14 @@ from amvnet.weights.file import save
 from lidarstreets import LIDAR_MODELS
 
 from fixtures.commands import fails, files, run_cli
+from fixtures.examples import with_examples
 from fixtures.scan_writers import pcd_bytes, write_bag1
 from fixtures.sensors import LASERS, ground_height, place
 from fixtures.tiny import fresh_weights, make_streets
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
+WEIGHTS = fresh_weights()
+NUSCENES_WEIGHTS = fresh_weights(NUSCENES)
 
 
 # --- measuring
@@ -120,8 +122,7 @@ def make_normaliser(
 ) -> tuple[Normaliser, list[str]]:
     """Return a normaliser for fresh weights, and the list of the lines that it says."""
     lines: list[str] = []
-    taxonomy = NUSCENES if is_nuscenes else SEMANTICKITTI
-    weights = replace(fresh_weights(taxonomy), sensor=trained_for)
+    weights = replace(NUSCENES_WEIGHTS if is_nuscenes else WEIGHTS, sensor=trained_for)
     return normaliser_for(weights, sensor, lines.append), lines
 
 
@@ -198,7 +199,7 @@ def test_axes_do_not_mirror(axes: Any) -> None:
 
 def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
     points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
-    weights = replace(fresh_weights(), sensor="hdl64e")
+    weights = replace(WEIGHTS, sensor="hdl64e")
     scan = normaliser_for(weights)(make_cloud(points), "a")
     np.testing.assert_array_equal(scan.points, points)
 
@@ -246,7 +247,7 @@ def test_weights_with_rings_as_rows_get_the_rows_of_the_training(kind: str) -> N
 
 def rows_in_nuscenes(scan: Scan) -> np.ndarray:
     """Return the (N,) rows of a scan in the range image of weights whose rows are rings."""
-    view = RangeView(fresh_weights(NUSCENES).model.range_view)
+    view = RangeView(NUSCENES_WEIGHTS.model.range_view)
     return view.rows(PointBatch.of([scan])).numpy()
 
 
@@ -332,8 +333,9 @@ COORDINATE = (
 STATED = [None, Sensor(fov_up=-40), KNOWN_SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]
 
 
-@settings(max_examples=200, deadline=None, derandomize=True, database=None)
-@given(
+@with_examples(
+    200,
+    derandomize=True,
     rows=st.lists(st.tuples(*[COORDINATE] * 4), max_size=8),
     repeated=st.sampled_from([1, 3, 60]),
     has_ring=st.booleans(),
@@ -438,8 +440,8 @@ def test_sensors_are_described_as_they_are_simulated() -> None:
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make weights for two sensors, and scans of another one."""
     root = tmp_path_factory.mktemp("sensors")
-    save(replace(fresh_weights(), sensor="hdl64e"), root / "w.safetensors")
-    save(replace(fresh_weights(NUSCENES), sensor="hdl32e"), root / "ring.safetensors")
+    save(replace(WEIGHTS, sensor="hdl64e"), root / "w.safetensors")
+    save(replace(NUSCENES_WEIGHTS, sensor="hdl32e"), root / "ring.safetensors")
 
     points, _ = place(LASERS["vlp16"], 0.9)
     points.tofile(root / "robot.bin")
@@ -527,7 +529,7 @@ def test_mistakes_are_one_line(mistake: str, world: Path, tmp_path: Path) -> Non
 
 def test_scans_of_datasets_are_not_normalised(tmp_path: Path) -> None:
     weights = tmp_path / "w.safetensors"
-    save(replace(fresh_weights(), sensor="hdl64e"), weights)
+    save(replace(WEIGHTS, sensor="hdl64e"), weights)
     data = make_streets(tmp_path / "data", ("00",), 1)
     path = data / "sequences/00/velodyne/000000.bin"
     points = np.fromfile(path, np.float32).reshape(-1, 4)
@@ -565,7 +567,7 @@ def test_sensors_with_far_more_or_fewer_lasers_are_not_alike(beams: int, other: 
 
 
 def test_a_stated_unit_settles_that_a_sensor_is_high() -> None:
-    weights = replace(fresh_weights(), sensor="hdl64e")
+    weights = replace(WEIGHTS, sensor="hdl64e")
     points, _ = place(LASERS["os1-64"], 6.0)
     cloud = Cloud(points[:, :3], np.linspace(0, 0.6, len(points)), name="a")
     fails(lambda: normaliser_for(weights)(cloud, "a"), "--unit")

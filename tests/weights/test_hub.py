@@ -21,6 +21,7 @@ from fixtures.tiny import fresh_weights, street, without
 
 NAME = "hf-hub:somebody/streets"
 POINTS = street(3, 300)[0]
+WEIGHTS = fresh_weights()
 
 
 class Hub:
@@ -60,13 +61,13 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
 
 
 def test_pushed_weights_can_be_loaded(hub: Hub) -> None:
-    address = amvnet.push(fresh_weights(), NAME, private=True)
+    address = amvnet.push(WEIGHTS, NAME, private=True)
     assert address == "https://hub/somebody/streets/commit/1"
     assert hub.calls[0] == {"repo_id": "somebody/streets", "private": True}
     folder = hub.root / "somebody/streets"
     assert sorted(path.name for path in folder.iterdir()) == ["README.md", "model.safetensors"]
 
-    pushed = amvnet.load(fresh_weights())
+    pushed = amvnet.load(WEIGHTS)
     loaded = amvnet.load(NAME)
     assert np.array_equal(loaded(POINTS).labels, pushed(POINTS).labels)
 
@@ -76,11 +77,11 @@ def test_what_the_hub_has_is_replaced_only_if_the_user_says_so(hub: Hub, file: s
     mine = hub.root / "somebody/streets" / file
     mine.parent.mkdir(parents=True)
     mine.write_bytes(b"hours of work")
-    fails(lambda: amvnet.push(fresh_weights(), NAME), "somebody/streets", file, "overwrite=True")
+    fails(lambda: amvnet.push(WEIGHTS, NAME), "somebody/streets", file, "overwrite=True")
     assert list(mine.parent.iterdir()) == [mine]
     assert mine.read_bytes() == b"hours of work"
 
-    amvnet.push(fresh_weights(), NAME, overwrite=True)
+    amvnet.push(WEIGHTS, NAME, overwrite=True)
     assert mine.read_bytes() != b"hours of work"
 
 
@@ -92,7 +93,7 @@ HOSTILE = (
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_names_that_no_repository_can_have_never_reach_the_hub(hub: Hub, name: str) -> None:
-    fails(lambda: amvnet.push(fresh_weights(), name), "OWNER/NAME")
+    fails(lambda: amvnet.push(WEIGHTS, name), "OWNER/NAME")
     fails(lambda: load(f"hf-hub:{name}"), "OWNER/NAME")
     assert not hub.calls
 
@@ -104,7 +105,7 @@ def test_a_revision_is_no_path(hub: Hub, revision: str) -> None:
 
 
 def test_a_revision_can_be_named(hub: Hub) -> None:
-    amvnet.push(fresh_weights(), NAME)
+    amvnet.push(WEIGHTS, NAME)
     load(f"{NAME}@v2")
     assert hub.calls[-1] == {"repo_id": "somebody/streets", "revision": "v2"}
 
@@ -112,7 +113,7 @@ def test_a_revision_can_be_named(hub: Hub) -> None:
 def test_the_commands_take_names_of_the_hub(
     hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    amvnet.push(save(fresh_weights(), tmp_path / "w.safetensors"), "somebody/streets")
+    amvnet.push(save(WEIGHTS, tmp_path / "w.safetensors"), "somebody/streets")
     scan = tmp_path / "a.bin"
     POINTS.tofile(scan)
     options = ("--weights", NAME, "--out", tmp_path / "out")
@@ -127,7 +128,7 @@ def test_the_commands_take_names_of_the_hub(
 
 
 def test_the_card_says_what_the_hub_and_people_need(hub: Hub) -> None:
-    amvnet.push(fresh_weights(), NAME, licence="cc-by-nc-sa-4.0")
+    amvnet.push(WEIGHTS, NAME, licence="cc-by-nc-sa-4.0")
     text = (hub.root / "somebody/streets/README.md").read_text()
     _, front_matter, card = text.split("---\n", 2)
 
@@ -144,7 +145,7 @@ def test_the_card_says_what_the_hub_and_people_need(hub: Hub) -> None:
 
 
 def test_a_card_without_a_licence_says_so() -> None:
-    assert "names no licence" in model_card(fresh_weights(), "w")
+    assert "names no licence" in model_card(WEIGHTS, "w")
 
 
 @pytest.mark.parametrize(
@@ -158,7 +159,7 @@ def test_a_card_without_a_licence_says_so() -> None:
     ],
 )
 def test_the_code_of_the_card_runs(dropped: tuple[str, ...], tmp_path: Path) -> None:
-    path = save(without(fresh_weights(), *dropped), tmp_path / "w.safetensors")
+    path = save(without(WEIGHTS, *dropped), tmp_path / "w.safetensors")
     card = model_card(load(path), str(path))
     code = card.split("```python\n")[1].split("```")[0]
 
@@ -180,13 +181,13 @@ def test_a_name_that_cannot_be_loaded_is_one_line(hub: Hub) -> None:
 
 
 def test_a_push_that_fails_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    fails(lambda: amvnet.push(fresh_weights(), "streets"), "OWNER/NAME")
+    fails(lambda: amvnet.push(WEIGHTS, "streets"), "OWNER/NAME")
 
     def refuse(**arguments: object) -> object:
         raise RuntimeError("no way in")
 
     monkeypatch.setattr(hub, "upload_folder", refuse)
-    fails(lambda: amvnet.push(fresh_weights(), NAME), "no way in", "hf auth login")
+    fails(lambda: amvnet.push(WEIGHTS, NAME), "no way in", "hf auth login")
 
 
 def test_without_the_client_the_message_says_how_to_install_it(
@@ -194,4 +195,4 @@ def test_without_the_client_the_message_says_how_to_install_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     fails(lambda: load(NAME), "pip install 'amvnet[hub]'")
-    fails(lambda: amvnet.push(fresh_weights(), NAME), "pip install 'amvnet[hub]'")
+    fails(lambda: amvnet.push(WEIGHTS, NAME), "pip install 'amvnet[hub]'")
