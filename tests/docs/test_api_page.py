@@ -6,15 +6,16 @@ import re
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
 
 import pytest
 
 import amvnet
 from amvnet.cli.main import COMMANDS
 
+from fixtures.pages import DocsPage, execute
+
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE = (DOCS / "api.md").read_text(encoding="utf-8")
+PAGE = DocsPage("docs/api.md")
 
 
 def load_hook() -> ModuleType:
@@ -28,20 +29,20 @@ def load_hook() -> ModuleType:
 
 
 def test_every_public_name_is_on_the_page() -> None:
-    assert {f"amvnet.{name}" for name in amvnet.__all__} <= set(re.findall(r"::: ([\w.]+)", PAGE))
+    assert {f"amvnet.{name}" for name in amvnet.__all__} <= set(
+        re.findall(r"::: ([\w.]+)", PAGE.text)
+    )
 
 
+@pytest.mark.full
 def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("embreex")
     pushed: list[str] = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(amvnet, "push", lambda weights, name, **_: pushed.append(name), False)
 
-    scope: dict[str, Any] = {}
-    for block in re.findall(r"```python\n(.*?)```", PAGE, re.S):
-        exec(block, scope)
-
-    assert scope["result"].labels.shape == (len(scope["scan"].points),)
+    variables = execute(PAGE.blocks("python"))
+    assert variables["result"].labels.shape == (len(variables["scan"].points),)
     assert pushed == ["me/amvnet"]
 
 

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from fixtures.commands import commands_of, run_cli
+from fixtures.pages import Changes, DocsPage, execute, run
 
-PAGE = "docs/first_labels.md"
+PAGE = DocsPage("docs/first_labels.md")
+CHANGES = Changes(values={"simulate": {"--sequences": 1, "--scans": 1}})
 
 
+@pytest.mark.full
 def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("embreex")
     monkeypatch.chdir(tmp_path)
-    for program, *arguments in commands_of(PAGE):
-        assert program == "amvnet"
-        if arguments[0] == "simulate":
-            arguments[arguments.index("--sequences") + 1] = "1"
-            arguments[arguments.index("--scans") + 1] = "1"
-        assert run_cli(*arguments) == (0, ""), arguments
-
+    run(PAGE.commands, CHANGES)
     assert Path("city.html").stat().st_size
     assert Path("coloured/000000.ply").stat().st_size
 
-    scope: dict[str, Any] = {}
-    page = (Path(__file__).parents[2] / PAGE).read_text(encoding="utf-8")
-    for block in re.findall(r"```python\n(.*?)```", page, re.S):
-        exec(block, scope)
-    assert "uncertain" in repr(scope["result"])
+    variables = execute(PAGE.blocks("python"))
+    assert "uncertain" in repr(variables["result"])

@@ -11,6 +11,8 @@ from typing import Any
 import matplotlib as mpl
 import pytest
 
+from fixtures.pages import execute
+
 DOCS = Path(__file__).parents[2] / "docs"
 NOTEBOOKS = sorted(DOCS.glob("*.ipynb"))
 LARGEST_NOTEBOOK = 20_000  # bytes
@@ -41,6 +43,7 @@ def test_a_notebook_is_small_and_has_no_outputs(path: Path) -> None:
             assert cell["execution_count"] is None
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_a_notebook_runs(
     path: Path,
@@ -51,11 +54,9 @@ def test_a_notebook_runs(
     pytest.importorskip("embreex")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(webbrowser, "open", lambda url: pytest.fail("a browser was opened"))
-    scope: dict[str, Any] = {}
+    cells = [cell["source"] for cell in cells_of(path) if cell["cell_type"] == "code"]
     with mpl.rc_context({"backend": "agg"}):
-        for cell in cells_of(path):
-            if cell["cell_type"] == "code":
-                exec("".join(cell["source"]), scope)
+        variables = execute(map("".join, cells))
 
     assert "do not rely on these labels" in capsys.readouterr().out
-    assert not scope["mended"].verdict.is_doubtful
+    assert not variables["mended"].verdict.is_doubtful

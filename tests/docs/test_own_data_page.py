@@ -12,11 +12,12 @@ import pytest
 from amvnet.weights.file import load, save
 from lidarstreets import LIDAR_MODELS
 
-from fixtures.commands import commands_of, run_cli
+from fixtures.commands import run_cli
 from fixtures.own_scans import CLASSES, make_own_scans
+from fixtures.pages import Changes, DocsPage, run
 from fixtures.tiny import fresh_weights, simulate_in_this_process, write_recipe
 
-PAGE = "docs/own_data.md"
+PAGE = DocsPage("docs/own_data.md")
 ONE_EPOCH = {"rv": {"epochs": 1}, "bev": {"epochs": 1}, "head": {"epochs": 1}}
 
 
@@ -24,10 +25,7 @@ def without_comments(text: str) -> str:
     return re.sub(r"\s*#.*", "", text)
 
 
-def page() -> str:
-    return (Path(__file__).parents[2] / PAGE).read_text(encoding="utf-8")
-
-
+@pytest.mark.full
 def test_every_command_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -37,29 +35,21 @@ def test_every_command_of_the_page_runs(
     monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "cache"))
     recipe = write_recipe(tmp_path / "tiny.yaml", training=ONE_EPOCH)
     save(fresh_weights(), tmp_path / "init.safetensors")
-    blocks = re.findall(r"```yaml\n(.*?)```", page(), re.S)
-    (few,) = [block for block in blocks if "structure: {from" in block]
+    (few,) = [block for block in PAGE.blocks("yaml") if "structure: {from" in block]
     (tmp_path / "few.yaml").write_text(few)
-    changes = {
-        "semantickitti-compact": str(recipe),
-        "sim-hdl64e": "init.safetensors",
-        "6": "1",  # epochs
-    }
+    changes = Changes(
+        words={"semantickitti-compact": str(recipe), "sim-hdl64e": "init.safetensors"},
+        values={
+            "simulate": {"--scans": 1},
+            "train": {"--training.rv.epochs": 1, "--training.bev.epochs": 1},
+        },
+    )
+    run(PAGE.commands, changes)
 
-    for program, *words in commands_of(PAGE):
-        assert program == "amvnet"
-        if words[0] == "simulate":
-            words[words.index("--scans") + 1] = "1"
-        else:
-            words = [changes.get(word, word) for word in words]
-        code, error = run_cli(*words)
-        assert code == 0, (words, error)
-        if words[0] == "simulate":
-            (block,) = [block for block in blocks if "ignored: [-1]" in block]
-            assert without_comments(block) == Path("robot/robot.yaml").read_text()
-
-    for run in ("robot", "new"):
-        weights = load(f"runs/{run}")
+    (block,) = [block for block in PAGE.blocks("yaml") if "ignored: [-1]" in block]
+    assert without_comments(block) == Path("robot/robot.yaml").read_text()
+    for name in ("robot", "new"):
+        weights = load(f"runs/{name}")
         assert weights.taxonomy.classes == tuple(CLASSES)
         assert weights.parts == ("range_net", "polar_net", "point_head")
     assert "the same command with --stage head" in capsys.readouterr().out

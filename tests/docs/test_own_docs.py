@@ -6,17 +6,13 @@ The commands run on small simulated scans.
 from __future__ import annotations
 
 import re
-import shlex
 import shutil
-import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from amvnet.cli.main import main
 from amvnet.data.formats.detect import ENDINGS
 from amvnet.data.formats.registry import PACKAGES
 from amvnet.inference.segmentation import Verdict
@@ -24,31 +20,16 @@ from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import load, save
 
 from fixtures.commands import files, succeed
+from fixtures.marks import with_quick
+from fixtures.pages import Changes, DocsPage, execute, run
 from fixtures.scan_writers import write_bag1, write_pcd
 from fixtures.sensors import LASERS, place
 from fixtures.tiny import fresh_weights
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGES = ("own_scans.md", "own_sensor.md")
-
-
-def read_page(page: str) -> str:
-    return (DOCS / page).read_text(encoding="utf-8")
-
-
-def blocks(page: str, language: str) -> list[str]:
-    """Return the blocks of a page in a language, without their indentation."""
-    texts = re.findall(rf"(?s)```{language}\n(.*?)```", read_page(page))
-    return [re.sub(r"(?m)^ +", "", text) for text in texts]
-
-
-def commands() -> list[str]:
-    """Return the lines of all bash blocks of the pages."""
-    lines = []
-    for page in PAGES:
-        for block in blocks(page, "bash"):
-            lines += block.splitlines()
-    return lines
+SCANS = DocsPage("docs/own_scans.md")
+SENSOR = DocsPage("docs/own_sensor.md")
+COMMANDS = SCANS.commands + SENSOR.commands
+QUICK = (SCANS.commands[0], SENSOR.commands[0])
 
 
 @pytest.fixture(scope="module")
@@ -66,33 +47,29 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows.astype(np.float32).tofile(folder / "rows.bin")
     write_pcd(folder / "cloud.pcd", points * np.array([1, 1, 1, 255], np.float32), "binary")
     write_bag1(folder / "drive.bag", {"/lidar/top": [points], "/lidar/side": [points]})
-    (folder / "robot.yaml").write_text(blocks("own_sensor.md", "yaml")[0])
+    (folder / "robot.yaml").write_text(SENSOR.blocks("yaml")[0])
     records = load("sim-hdl64e").training
     save(replace(fresh_weights(), training=records, sensor="hdl64e"), folder / "tiny.safetensors")
     return folder
 
 
-@pytest.mark.parametrize("command", commands())
+@pytest.mark.parametrize("command", with_quick(COMMANDS, QUICK), ids=" ".join)
 def test_every_command_runs(
-    command: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: list[str],
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    words = shlex.split(command)
-    if words[0] == "pip":
-        (extra,) = re.findall(r"\[(\w+)\]", command)
-        project = tomllib.loads((DOCS.parent / "pyproject.toml").read_text(encoding="utf-8"))
-        assert extra in project["project"]["optional-dependencies"]
-        return
-
-    assert words[0] == "amvnet"
     monkeypatch.chdir(folder)
     shutil.rmtree("labels", ignore_errors=True)  # of another command
-    tiny = [word.replace("sim-hdl64e", "tiny.safetensors") for word in words[1:]]
-    assert main(tiny) == 0
-    text = capsys.readouterr().out
-    assert "assumed" in text
-    assert re.search(r"\d+ label files? in labels", text)
+    run([command], Changes(words={"sim-hdl64e": "tiny.safetensors"}))
+    if command[0] == "amvnet":
+        text = capsys.readouterr().out
+        assert "assumed" in text
+        assert re.search(r"\d+ label files? in labels", text)
 
 
+@pytest.mark.full
 def test_the_promised_files_are_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     inputs = "scan.bin more_scans/ drive.bag --topic /lidar/top"
@@ -105,12 +82,11 @@ def test_the_promised_files_are_there(folder: Path, monkeypatch: pytest.MonkeyPa
     }
 
 
+@pytest.mark.full
 def test_the_python_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
-    scope: dict[str, Any] = {}
-    for block in blocks("own_scans.md", "python"):
-        exec(block, scope)
-    assert len(scope["result"].labels) == 16 * 360  # lasers, and firings of each
+    variables = execute(SCANS.blocks("python"))
+    assert len(variables["result"].labels) == 16 * 360  # lasers, and firings of each
 
 
 def test_the_line_that_is_shown_is_the_one_that_is_said(
@@ -120,7 +96,7 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
     succeed("predict cloud.pcd --weights sim-hdl64e --method bev --out labels --overwrite")
     lines = capsys.readouterr().out.splitlines()
     (printed,) = [line for line in lines if line.startswith("cloud.pcd")]
-    (documented,) = re.findall(r"    (cloud\.pcd: .*)\n    (.*)\n", read_page("own_scans.md"))
+    (documented,) = re.findall(r"    (cloud\.pcd: .*)\n    (.*)\n", SCANS.text)
 
     # The measured height differs by some millimetres.
     heights = r"\d\.\d\d m over the ground \(moved by -\d\.\d\d m"
@@ -128,7 +104,7 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
 
 
 def test_the_table_of_formats_is_that_of_the_code() -> None:
-    page = read_page("own_scans.md").partition("## Formats")[2]
+    page = SCANS.text.partition("## Formats")[2]
     table = re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE)[0]
     extras = {}
     for endings, _, needs in (row.strip("|").split(" | ") for row in table.splitlines()[2:]):
@@ -143,7 +119,7 @@ def test_the_table_of_formats_is_that_of_the_code() -> None:
 
 
 def test_the_share_that_is_warned_about_is_that_of_the_weights() -> None:
-    (percent,) = re.findall(r"above (\d+) % for `sim-hdl64e`", read_page("own_scans.md"))
+    (percent,) = re.findall(r"above (\d+) % for `sim-hdl64e`", SCANS.text)
     weights = load("sim-hdl64e")
     usual = weights.usual_uncertain_at(weights.model.assertion.threshold)
     assert not Verdict(int(percent) / 100, usual).is_doubtful
@@ -152,5 +128,5 @@ def test_the_share_that_is_warned_about_is_that_of_the_weights() -> None:
 
 def test_the_names_of_sensors_are_those_that_are_known() -> None:
     pattern = r"(?s)which states the lasers and the field of view: (.*?)\. "
-    names = re.findall(pattern, read_page("own_sensor.md"))[0]
+    names = re.findall(pattern, SENSOR.text)[0]
     assert re.findall(r"`([\w-]+)`", names) == list(KNOWN_SENSORS)

@@ -4,35 +4,41 @@ from __future__ import annotations
 
 import re
 import tomllib
+from functools import cache
 from pathlib import Path
 from typing import get_args
 
 import pytest
 
 from amvnet.cli.main import COMMANDS, WITH_RECIPE
-from amvnet.cli.parser import make_parser
+from amvnet.cli.parser import Parser, make_parser
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
 from amvnet.models.methods import EngineName
 
-from fixtures.commands import commands_of
+from fixtures.pages import DocsPage
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))
 
 
+@cache
+def parser_of(command: str) -> Parser:
+    parser = make_parser(command, COMMANDS[command])
+    if command in WITH_RECIPE:
+        add_recipe(parser, Recipe())
+    return parser
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_every_command_can_be_parsed(page: str) -> None:
-    for words in commands_of(page):
+    for words in DocsPage(page).commands:
         if "amvnet" not in words:
             continue
         command, *arguments = words[words.index("amvnet") + 1 :]
         if command.startswith("--") or arguments[-1:] in (["--help"], [HELP_ALL]):
             continue
-        parser = make_parser(command, COMMANDS[command])
-        if command in WITH_RECIPE:
-            add_recipe(parser, Recipe())
-        parser.values(arguments)
+        parser_of(command).values(arguments)
 
 
 def test_make_bench_asks_for_engines_that_there_are() -> None:

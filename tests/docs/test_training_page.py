@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -16,7 +12,8 @@ import pytest
 from amvnet.config.recipes import recipe_names
 from amvnet.weights.file import load, save
 
-from fixtures.commands import commands_of, files, run_cli
+from fixtures.commands import files
+from fixtures.pages import Changes, DocsPage, run
 from fixtures.scan_writers import write_pcd
 from fixtures.tiny import (
     GOLDEN,
@@ -25,6 +22,8 @@ from fixtures.tiny import (
     write_recipe,
 )
 
+TRAINING = DocsPage("docs/training.md")
+FINE_TUNING = DocsPage("docs/finetuning.md")
 TEST = tuple(str(sequence) for sequence in range(11, 22))
 
 # What makes a recipe short: of one process, and of two that share the batches.
@@ -42,6 +41,10 @@ def downloads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     _write_archives(tmp_path)
     shutil.copytree(GOLDEN / "nuscenes", tmp_path / "data/nuscenes")
+    scenes = tmp_path / "data/nuscenes/v1.0-mini/scene.json"
+    text = scenes.read_text()
+    assert "scene-0916" in text
+    scenes.write_text(text.replace("scene-0916", "scene-0061"))  # to train on
     for name in recipe_names():
         write_recipe(tmp_path / f"{name}.tiny.yaml", name, training=ONE_EPOCH_OF_TWO)
     write_recipe(tmp_path / "mine.yaml", training=ONE_EPOCH)
@@ -61,43 +64,16 @@ def _write_archives(folder: Path) -> None:
     shutil.rmtree(streets)
 
 
-def run(words: list[str], folder: Path) -> None:
-    """Run a command of a page, made small.
-
-    The recipes are tiny, /data lies in the folder of the test, and torchrun starts two processes on
-    the CPU instead of eight on GPUs.
-    """
-    smaller = {"8": "2", "cuda": "cpu"} if words[0] == "torchrun" else {}
-    if "amvnet" in words:
-        for name in recipe_names():
-            smaller[name] = f"{name}.tiny.yaml"
-
-    arguments = []
-    for word in words[1:]:
-        arguments.append(smaller.get(word, word).replace("/data/", f"{folder}/data/"))
-    if words[0] == "amvnet":
-        assert run_cli(*arguments) == (0, ""), words
-        return
-
-    command = {
-        "python": [sys.executable],
-        "torchrun": [sys.executable, "-m", "torch.distributed.run"],
-    }[words[0]]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    process = subprocess.run(
-        [*command, *arguments], capture_output=True, text=True, check=False, env=environment
-    )
-    assert process.returncode == 0, process.stderr
-
-
 @pytest.mark.full
 def test_the_commands_on_training_run(downloads: Path) -> None:
-    count = 0
-    for words in commands_of("docs/training.md"):
-        if "/data/" in " ".join(words):
-            run(words, downloads)
-            count += 1
-    assert count >= 8
+    commands = [words for words in TRAINING.commands if "/data/" in " ".join(words)]
+    assert len(commands) >= 8
+    changes = Changes(
+        words={name: f"{name}.tiny.yaml" for name in recipe_names()},
+        texts={"/data/": f"{downloads}/data/"},
+        values={"torchrun": {"--nproc-per-node": 2, "--training.workers": 2}},
+    )
+    run(commands, changes)
 
     assert load(downloads / "runs/kitti").parts == ("range_net", "polar_net", "point_head")
     assert (downloads / "entry.zip").stat().st_size
@@ -105,6 +81,7 @@ def test_the_commands_on_training_run(downloads: Path) -> None:
     assert (downloads / "runs/kitti/figures/methods.csv").is_file()
 
 
+@pytest.mark.full
 def test_the_commands_on_fine_tuning_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     make_streets(tmp_path / "data/kitti/dataset", ("00", "08"))
@@ -114,21 +91,22 @@ def test_the_commands_on_fine_tuning_run(tmp_path: Path, monkeypatch: pytest.Mon
         for path in scans.glob("*.bin"):
             points = np.fromfile(path, np.float32).reshape(-1, 4)
             write_pcd(tmp_path / site / "clouds" / f"{path.stem}.pcd", points, "binary")
-    page = (Path(__file__).parents[2] / "docs/finetuning.md").read_text(encoding="utf-8")
-    (description,) = re.findall(r"```yaml\n(.*?)```", page, re.S)
+    (description,) = FINE_TUNING.blocks("yaml")
     (tmp_path / "mine.yaml").write_text(description)
-    save(fresh_weights(), tmp_path / "sim-hdl64e")
-    write_recipe(tmp_path / "finetune.tiny.yaml", "finetune", training=ONE_EPOCH)
+    save(fresh_weights(), tmp_path / "init.safetensors")
+    recipe = write_recipe(tmp_path / "tiny.yaml", "finetune", training=ONE_EPOCH)
 
-    commands = commands_of("docs/finetuning.md")
-    assert len(commands) == 5
-    for words in commands:
-        run([word.replace("sim-hdl64e", "./sim-hdl64e") for word in words], tmp_path)
+    assert len(FINE_TUNING.commands) == 5
+    changes = Changes(
+        words={"finetune": str(recipe), "sim-hdl64e": "init.safetensors"},
+        texts={"/data/": f"{tmp_path}/data/"},
+    )
+    run(FINE_TUNING.commands, changes)
     for name in ("finetuned", "mine"):
         assert load(f"runs/{name}").parts == ("range_net", "polar_net", "point_head")
 
     # The classes are those of the initial weights, so the head stays as it is.
     trained = load("runs/mine").tensors
-    for name, values in load("./sim-hdl64e").tensors.items():
+    for name, values in load("init.safetensors").tensors.items():
         if name.startswith("point_head."):
             assert values.equal(trained[name]), name

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +35,8 @@ from amvnet.scan import Scan
 from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.weights.file import load
 
+from fixtures.marks import with_quick
+from fixtures.processes import PATIENCE
 from fixtures.scan_writers import WRITERS, pcd_bytes, some_points
 from fixtures.sensors import LASERS, place
 
@@ -49,6 +52,12 @@ FLOATS = (".points", ".image", ".features", ".scores")  # the arrays of float32;
 pytestmark = pytest.mark.skipif(NODE is None, reason="Node.js is not installed")
 
 
+@cache
+def expectation(weights: str) -> Expectation:
+    """Return what built-in weights expect of a scan."""
+    return expectation_of(load(weights))
+
+
 @dataclass(frozen=True)
 class Case:
     """A scan file, the weights that it is normalised for, and what their rows are, if changed."""
@@ -59,7 +68,7 @@ class Case:
 
     @property
     def expected(self) -> Expectation:
-        expected = expectation_of(load(self.weights))
+        expected = expectation(self.weights)
         view = expected.view
         rows = self.rows or view.rows
         # Coarse images have hidden points.
@@ -89,7 +98,7 @@ def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
     listing = folder / "jobs.json"
     listing.write_text(json.dumps(jobs))
     command = [str(NODE), str(DRIVER), str(PAGE), str(listing)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
 
     results: list[dict[str, Any]] = json.loads(done.stdout)
@@ -264,20 +273,28 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
 )
 
 
+MAKERS = {make.__name__: make for make in SCANS}
+WITH_VIEWS = ("kitti_like", "nuscenes_like", "higher_with_lost_returns")
+Made = tuple[Case, dict[str, Any]]  # a scan, and what the page makes of it
+
+
 @pytest.fixture(scope="module")
-def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Case, dict[str, Any]]]:
-    """Each scan, and what the page makes of it, by its name."""
-    folder = tmp_path_factory.mktemp("scans")
-    cases = [make(folder) for make in SCANS]
-    names = [make.__name__ for make in SCANS]
-    return dict(zip(names, zip(cases, run_page(cases, folder), strict=True), strict=True))
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Made]:
+    """A function that takes the name of a scan."""
+
+    @cache
+    def make(name: str) -> Made:
+        folder = tmp_path_factory.mktemp(name)
+        case = MAKERS[name](folder)
+        (result,) = run_page([case], folder)
+        return case, result
+
+    return make
 
 
-@pytest.mark.parametrize("name", [make.__name__ for make in SCANS])
-def test_a_scan_is_normalised_as_by_the_package(
-    name: str, scans: dict[str, tuple[Case, dict[str, Any]]]
-) -> None:
-    case, page = scans[name]
+@pytest.mark.parametrize("name", with_quick(MAKERS, WITH_VIEWS))
+def test_a_scan_is_normalised_as_by_the_package(name: str, made: Callable[[str], Made]) -> None:
+    case, page = made(name)
     scan, line = normalised(case)
     valid = scan.valid
     assert page["text"] == line
@@ -293,11 +310,9 @@ def rows_of(case: Case, scan: Scan) -> np.ndarray:
     return image_rows(case.expected.view, scan.select(scan.valid))
 
 
-@pytest.mark.parametrize("name", ["kitti_like", "nuscenes_like", "higher_with_lost_returns"])
-def test_the_views_equal_those_of_the_onnx_runner(
-    name: str, scans: dict[str, tuple[Case, dict[str, Any]]]
-) -> None:
-    case, page = scans[name]
+@pytest.mark.parametrize("name", WITH_VIEWS)
+def test_the_views_equal_those_of_the_onnx_runner(name: str, made: Callable[[str], Made]) -> None:
+    case, page = made(name)
     points = page["points"].reshape(-1, 4)
     image, pixel = range_image(case.expected.view, Scan(points, row=page["rows"]))
     features, pillar, voxel = polar_features(POLAR, points)
@@ -309,11 +324,11 @@ def test_the_views_equal_those_of_the_onnx_runner(
     assert np.allclose(page["features"], features.ravel(), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["kitti_like", "nuscenes_like", "higher_with_lost_returns"])
+@pytest.mark.parametrize("name", WITH_VIEWS)
 def test_the_scores_of_points_equal_those_of_the_onnx_runner(
-    name: str, scans: dict[str, tuple[Case, dict[str, Any]]]
+    name: str, made: Callable[[str], Made]
 ) -> None:
-    case, page = scans[name]
+    case, page = made(name)
     view = case.expected.view
     points = page["points"].reshape(-1, 4)
     image, pixel = range_image(view, Scan(points, row=page["rows"]))
@@ -326,10 +341,8 @@ def test_the_scores_of_points_equal_those_of_the_onnx_runner(
     assert not np.allclose(expected, scores[pixel])  # some points are hidden
 
 
-def test_neighbours_are_as_near_as_those_of_the_package(
-    scans: dict[str, tuple[Case, dict[str, Any]]],
-) -> None:
-    _, page = scans["higher_with_lost_returns"]
+def test_neighbours_are_as_near_as_those_of_the_package(made: Callable[[str], Made]) -> None:
+    _, page = made("higher_with_lost_returns")
     xyz = page["points"].reshape(-1, 4)[:, :3]
     own = np.arange(0, min(30_000, len(xyz)), 97)
     expected = nearest_others(xyz, own, NEIGHBOURS)
@@ -353,7 +366,7 @@ def test_few_points_are_repeated_as_neighbours(count: int, tmp_path: Path) -> No
 
 
 def test_formats_give_the_points_of_the_package(tmp_path: Path) -> None:
-    points = some_points(5000)
+    points = some_points(2000)
     names = [name for name in WRITERS if name.endswith((".bin", ".pcd", ".ply"))]
     assert set(FORMATS) < set(names)
     for name in names:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import shutil
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,14 +19,13 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.scores import ScoreFolder, ScorePair
 from amvnet.weights.file import load, save
 
-from fixtures.commands import commands_of, files, run_cli
+from fixtures.commands import files, run_cli
+from fixtures.pages import Changes, DocsPage, run
 from fixtures.tiny import (
     fresh_weights,
     make_simulation_quick,
-    make_streets,
     street,
     without,
-    write_recipe,
 )
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -38,25 +35,19 @@ KEYS = {"a": "rv", "b": "bev"}
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a dataset, weights, and predictions with scores by both methods, all to be only read."""
-    root = tmp_path_factory.mktemp("world")
-    make_streets(root / "data")
-    weights = root / "w.safetensors"
-    save(fresh_weights(), weights)
-    write_recipe(root / "recipe.yaml")
-
-    for method in ("amvnet", "ensemble"):
-        out = ("--out", root / method, "--method", method, "--scores")
-        assert run_cli("predict", root / "data", "--weights", weights, *out)[0] == 0
-    return root
+def labels(world: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders of predictions by two methods, to be only read."""
+    ensemble = tmp_path_factory.mktemp("ensemble")
+    options = ("--weights", world / "w.safetensors", "--method", "ensemble", "--out", ensemble)
+    assert run_cli("predict", world / "data", *options) == (0, "")
+    return {"amvnet": world / "predictions", "ensemble": ensemble}
 
 
 def run_fuse(
     world: Path, out: Path, *options: Any, a: Path | None = None, b: Path | None = None
 ) -> str:
     """Run `amvnet fuse` on the world's scores, or on others; return the error message."""
-    scores = ("--scores-a", a or world / "amvnet", "--scores-b", b or world / "amvnet")
+    scores = ("--scores-a", a or world / "predictions", "--scores-b", b or world / "predictions")
     options = (*scores, "--out", out, *options)
     code, error = run_cli("fuse", world / "data", *options)
     expected = (2, 1) if error else (0, 0)
@@ -74,7 +65,7 @@ def read_labels(folder: Path) -> np.ndarray:
 
 def read_probabilities(world: Path, key: str, scan: str = SCAN) -> np.ndarray:
     """Read the (N, K) probabilities of one network."""
-    with np.load(world / "amvnet" / f"{scan}.npz") as file:
+    with np.load(world / "predictions" / f"{scan}.npz") as file:
         return file[key]
 
 
@@ -93,23 +84,25 @@ def write_scores(folder: Path, scores: Any, scan: str = SCAN) -> Path:
 
 
 @pytest.mark.parametrize("method", ["amvnet", "ensemble"])
-def test_the_scores_of_predict_give_its_labels(world: Path, tmp_path: Path, method: str) -> None:
+def test_the_scores_of_predict_give_its_labels(
+    world: Path, labels: dict[str, Path], tmp_path: Path, method: str
+) -> None:
     head = ("--head", world / "w.safetensors") if method == "amvnet" else ()
     assert run_fuse(world, tmp_path, *head) == ""
 
-    assert (read_labels(tmp_path) == read_labels(world / method)).mean() >= 0.999
+    assert (read_labels(tmp_path) == read_labels(labels[method])).mean() >= 0.999
 
-    label_files = {name for name in files(world / method) if name.endswith(".label")}
+    label_files = {name for name in files(labels[method]) if name.endswith(".label")}
     assert files(tmp_path) == label_files
 
 
-def test_the_head_and_tau_count(world: Path, tmp_path: Path) -> None:
+def test_the_head_and_tau_count(world: Path, labels: dict[str, Path], tmp_path: Path) -> None:
     options = ("--head", world / "w.safetensors", "--tau")
     run_fuse(world, tmp_path / "none", *options, 0)
     run_fuse(world, tmp_path / "all", *options, 1)
 
     without_head = read_labels(tmp_path / "none")
-    assert (without_head == read_labels(world / "ensemble")).mean() >= 0.999
+    assert (without_head == read_labels(labels["ensemble"])).mean() >= 0.999
     assert (read_labels(tmp_path / "all") != without_head).mean() > 0.1
 
 
@@ -139,7 +132,9 @@ def test_single_scans_are_fused_and_lost_points_have_no_class(
 
 
 @pytest.mark.parametrize("sides", ["a", "b", "both"])
-def test_logits_are_the_same_as_their_softmax(world: Path, tmp_path: Path, sides: str) -> None:
+def test_logits_are_the_same_as_their_softmax(
+    world: Path, labels: dict[str, Path], tmp_path: Path, sides: str
+) -> None:
     for side, key in KEYS.items():
         for scan in (SCAN, NEXT_SCAN):
             scores = read_probabilities(world, key, scan).astype(np.float64).clip(1e-6)
@@ -150,7 +145,7 @@ def test_logits_are_the_same_as_their_softmax(world: Path, tmp_path: Path, sides
     options = ("--sequences", "08", "--logits", sides)
     out = tmp_path / "out"
     assert run_fuse(world, out, *options, a=tmp_path / "a", b=tmp_path / "b") == ""
-    expected = read_labels(world / "ensemble/sequences/08")
+    expected = read_labels(labels["ensemble"] / "sequences/08")
     assert (read_labels(out) == expected).mean() >= 0.999
 
 
@@ -271,7 +266,7 @@ def test_broken_scores_are_one_line_that_says_what_to_do(world: Path, tmp_path: 
             path = folder / f"{SCAN}.npz"
             path.write_bytes(path.read_bytes()[: -broken.cut])
 
-        scores = ("--scores-a", world / "amvnet", "--scores-b", folder)
+        scores = ("--scores-a", world / "predictions", "--scores-b", folder)
         out = tmp_path / "out"
         code, error = run_cli("fuse", tmp_path / "data", *scores, "--out", out)
         assert (code, error.count("\n")) == (2, 1), kind
@@ -292,8 +287,8 @@ def test_wrong_options_of_fuse_are_one_line(world: Path, tmp_path: Path) -> None
 
 def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) -> None:
     arguments = ("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path)
-    first = ("--scores-a", world / "amvnet")
-    second = ("--scores-b", world / "amvnet")
+    first = ("--scores-a", world / "predictions")
+    second = ("--scores-b", world / "predictions")
     cases = {
         "--stage head": (*first, *second),
         "--scores-b": (*first, "--stage", "head"),
@@ -315,21 +310,21 @@ def train_head_arguments(world: Path, out: Path) -> list[Any]:
 
 
 def score_options(world: Path) -> list[Any]:
-    scores = world / "amvnet"
+    scores = world / "predictions"
     return ["--scores-a", scores, "--scores-b", scores]
 
 
 @pytest.fixture(scope="module")
-def run(world: Path) -> Path:
+def head(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train the head alone, on the networks' scores from files."""
-    out = world / "head"
+    out = tmp_path_factory.mktemp("trained") / "head"
     arguments = [*train_head_arguments(world, out), *score_options(world)]
     assert run_cli(*arguments) == (0, "")
     return out
 
 
 def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(
-    world: Path, run: Path, tmp_path: Path
+    world: Path, head: Path, tmp_path: Path
 ) -> None:
     # Without the world's head, which would be trained further
     networks = tmp_path / "networks.safetensors"
@@ -338,7 +333,7 @@ def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(
     assert run_cli(*arguments) == (0, "")
 
     from_networks = load(tmp_path / "run")
-    from_files = load(run)
+    from_files = load(head)
     assert from_networks.part("point_head").keys() == from_files.part("point_head").keys()
     # A score that float16 puts on the other side of tau changes which points are drawn: the two
     # are alike, not equal.
@@ -347,31 +342,31 @@ def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(
 
 
 def test_the_weights_hold_only_the_head_and_fuse_takes_them(
-    world: Path, run: Path, tmp_path: Path
+    world: Path, head: Path, tmp_path: Path
 ) -> None:
-    weights = load(run)
+    weights = load(head)
     assert weights.parts == ("point_head",)
     assert weights.model.assertion == fresh_weights().model.assertion
 
-    assert run_fuse(world, tmp_path, "--head", run) == ""
+    assert run_fuse(world, tmp_path, "--head", head) == ""
 
     points = np.fromfile(world / "data/sequences/08/velodyne/000000.bin", np.float32).reshape(-1, 4)
     f = read_probabilities(world, "rv")
     g = read_probabilities(world, "bev")
-    ids = fuse(points, f, g, head=run)
+    ids = fuse(points, f, g, head=head)
     labels = np.fromfile(tmp_path / f"{SCAN}.label", np.uint32)
     assert np.array_equal(weights.taxonomy.to_raw(ids), labels)
 
-    options = ("--weights", run, "--out", tmp_path / "x")
+    options = ("--weights", head, "--out", tmp_path / "x")
     _, error = run_cli("predict", world / "data", *options)
     assert "range_net" in error
 
 
-def test_the_run_resumes_with_its_own_scores_only(world: Path, run: Path) -> None:
-    arguments = [*train_head_arguments(world, run), "--resume"]
+def test_the_run_resumes_with_its_own_scores_only(world: Path, head: Path) -> None:
+    arguments = [*train_head_arguments(world, head), "--resume"]
     assert run_cli(*arguments, *score_options(world)) == (0, "")
 
-    scores = ["--scores-a", world / "amvnet", "--scores-b", world / "amvnet"]
+    scores = ["--scores-a", world / "predictions", "--scores-b", world / "predictions"]
     code, error = run_cli(*arguments, *scores, "--logits", "a")
     assert code == 2
     assert "scores" in error
@@ -402,22 +397,13 @@ def test_a_digest_of_scores_sees_any_changed_point_of_an_archive_and_the_last_of
 # ---- the page of the docs
 
 
+@pytest.mark.full
 def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_simulation_quick(monkeypatch)
     monkeypatch.chdir(tmp_path)
     shutil.copy(DOCS / "tiny_model.py", tmp_path)
-    commands = commands_of("docs/fusing.md")
+    commands = DocsPage("docs/fusing.md").commands
     assert len(commands) >= 8
-    for program, *arguments in commands:
-        if program == "python":
-            subprocess.run([sys.executable, *arguments], check=True)
-            continue
-
-        assert program == "amvnet"
-        if "--scans" in arguments:
-            arguments[arguments.index("--scans") + 1] = "1"
-        if arguments[0] == "train":
-            arguments += ["--training.head.epochs", "1", "--training.head.points", "3000"]
-        assert run_cli(*arguments) == (0, ""), arguments
-
+    head = {"--training.head.epochs": 1, "--training.head.points": 3000}
+    run(commands, Changes(values={"simulate": {"--scans": 1}, "train": head}))
     assert (read_labels(Path("again")) == read_labels(Path("both"))).mean() >= 0.999

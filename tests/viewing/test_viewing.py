@@ -30,7 +30,8 @@ from amvnet.viewing.shown_scans import RIGHT, ShownScan, shown_scan
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page, with_script
-from fixtures.commands import commands_of, files, run_cli
+from fixtures.commands import files, run_cli
+from fixtures.pages import Changes, DocsPage, run
 from fixtures.scan_writers import write_bag1
 from fixtures.tiny import (
     GOLDEN,
@@ -599,19 +600,15 @@ def test_five_real_scans_take_a_few_megabytes(tmp_path: Path) -> None:
 
 
 def test_the_commands_of_the_documentation_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_simulation_quick(monkeypatch)
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.chdir(tmp_path)
-    save(fresh_weights(), tmp_path / "tiny.safetensors")
-
-    for program, *words in commands_of("docs/viewing.md"):
-        assert program == "amvnet"
-        command = [word.replace("sim-hdl64e", "tiny.safetensors") for word in words]
-        assert run_cli(*command) == (0, ""), command
-        if "--html" in command:
-            path = tmp_path / command[command.index("--html") + 1]
-            assert path.stat().st_size > 0
+    commands = DocsPage("docs/viewing.md").commands
+    run(commands, Changes(words={"sim-hdl64e": f"{world}/w.safetensors"}))
+    for words in commands:
+        if "--html" in words:
+            assert Path(words[words.index("--html") + 1]).stat().st_size > 0
     assert len(opened) == 1
