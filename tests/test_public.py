@@ -306,6 +306,7 @@ WRONG = {
 SKIPPED = ("torch", "scipy", "yaml", "safetensors", "laspy", "rosbags", "huggingface_hub")
 
 
+@pytest.mark.full
 def test_a_users_script_passes_strict_types_and_mistakes_do_not(tmp_path: Path) -> None:
     assert (resources.files("amvnet") / "py.typed").is_file()
     (tmp_path / "script.py").write_text(SCRIPT)

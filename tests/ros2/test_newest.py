@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from threading import Event
+from threading import Event, Thread
 
 from amvnet_ros.newest import NewestOnly
 
-WAIT = 20.0  # seconds: much more than needed, on a busy machine too
+from fixtures.processes import PATIENCE
 
 
 def ignore(error: Exception) -> None:
@@ -17,7 +17,7 @@ def ignore(error: Exception) -> None:
 
 def until(condition: Callable[[], bool]) -> None:
     """Wait until a condition holds."""
-    end = time.monotonic() + WAIT
+    end = time.monotonic() + PATIENCE  # comes only if the condition never holds
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.001)
@@ -30,12 +30,12 @@ def test_what_arrives_during_the_work_is_dropped_but_for_the_newest() -> None:
 
     def work(item: int) -> None:
         begun.set()
-        assert go_on.wait(WAIT)
+        assert go_on.wait(PATIENCE)
         done.append(item)
 
     worker = NewestOnly(work, ignore)
     assert not worker.put(0)
-    assert begun.wait(WAIT)
+    assert begun.wait(PATIENCE)
 
     # 0 is at work: 1 waits, and each later one takes the place of the one before.
     assert [worker.put(item) for item in range(1, 6)] == [False, True, True, True, True]
@@ -57,19 +57,30 @@ def test_a_slow_source_loses_nothing() -> None:
 
 def test_closing_waits_for_the_item_at_work_and_for_no_other() -> None:
     begun = Event()
-    done: list[int] = []
+    go_on = Event()
+    done: list[object] = []
 
     def work(item: int) -> None:
         begun.set()
-        time.sleep(0.05)
+        assert go_on.wait(PATIENCE)
         done.append(item)
+
+    def close() -> None:
+        worker.close()
+        done.append("closed")
 
     worker = NewestOnly(work, ignore)
     worker.put(0)
-    assert begun.wait(WAIT)
+    assert begun.wait(PATIENCE)
     worker.put(1)
-    worker.close()
-    assert done == [0]
+
+    closing = Thread(target=close)
+    closing.start()
+    until(lambda: not worker._is_open)
+    assert not done
+    go_on.set()
+    closing.join(PATIENCE)
+    assert done == [0, "closed"]
 
 
 def test_an_error_ends_the_work_and_is_told() -> None:

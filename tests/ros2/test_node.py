@@ -19,14 +19,13 @@ from rosbags.rosbag2 import StoragePlugin
 
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.torch import TorchEngine
-from amvnet.weights.file import save
 
 from fixtures.commands import succeed
+from fixtures.processes import PATIENCE
 from fixtures.ros import STORE, FakeNode, install, over_the_wire
 from fixtures.scan_writers import cloud_message, write_bag2
-from fixtures.tiny import fresh_weights, street
+from fixtures.tiny import street
 
-WAIT = 60.0  # seconds: much more than needed, on a busy machine too
 RECORD = np.dtype(
     {
         "names": ["x", "y", "z", "rgb", "label", "uncertain"],
@@ -50,11 +49,9 @@ def ros_message(points: np.ndarray, **changes: Any) -> Any:
     return message
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    save(fresh_weights(), path)
-    return path
+@pytest.fixture
+def weights(world: Path) -> Path:
+    return world / "w.safetensors"
 
 
 @pytest.fixture
@@ -84,7 +81,7 @@ def send(node: Any, message: Any) -> None:
     node._worker._work = work
     receive, _ = node.callbacks["points"]
     receive(message)
-    assert is_done.wait(WAIT)
+    assert is_done.wait(PATIENCE)
     node._worker._work = label
 
 
@@ -225,7 +222,7 @@ def test_an_error_of_the_program_ends_the_node_with_its_traceback(
     monkeypatch.setattr(TorchEngine, "score", fail)
     receive, _ = node.callbacks["points"]
     receive(ros_message(scan(0)))
-    node._worker._thread.join(WAIT)
+    node._worker._thread.join(PATIENCE)
 
     assert node.exit_code == 1
     ((_, text),) = [line for line in node.logger.lines if line[0] == "fatal"]

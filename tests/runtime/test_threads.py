@@ -19,8 +19,8 @@ from torch import Tensor
 import amvnet
 from amvnet.models import point_head, polar_net
 from amvnet.runtime.threads import WAITING, run_parts
-from amvnet.weights.file import save
 
+from fixtures.processes import PATIENCE
 from fixtures.tiny import fresh_weights, street
 
 # Segments with two threads, and again in a forked pool.
@@ -62,19 +62,19 @@ def run_python(code: str, *arguments: str, environment: Mapping[str, str] | None
         [sys.executable, "-c", code, *arguments],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE,
         env={**inherited, **(environment or {})},
     )
     assert process.returncode == 0, process.stderr
     return process.stdout.strip()
 
 
+@pytest.mark.full
 @pytest.mark.skipif(
     "fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork"
 )
-def test_a_forked_pool_segments_as_its_parent(tmp_path: Path) -> None:
-    save(fresh_weights(), tmp_path / "w.safetensors")
-    run_python(FORKING, str(tmp_path / "w.safetensors"))
+def test_a_forked_pool_segments_as_its_parent(world: Path) -> None:
+    run_python(FORKING, str(world / "w.safetensors"))
 
 
 def test_the_command_line_lets_threads_sleep_before_it_imports_torch() -> None:
@@ -103,7 +103,7 @@ def test_parts_have_threads_of_their_own_if_threads_sleep(
     policy: str, threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OMP_WAIT_POLICY", policy)
-    both_run = threading.Barrier(threads, timeout=60)
+    both_run = threading.Barrier(threads, timeout=PATIENCE)
 
     def run(part: int) -> tuple[int, int, int, Tensor]:
         both_run.wait()
@@ -138,7 +138,7 @@ def test_the_networks_run_side_by_side_if_threads_sleep(
 ) -> None:
     monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     # Tiny networks could follow each other in one thread.
-    all_run = threading.Barrier(at_once, timeout=60)
+    all_run = threading.Barrier(at_once, timeout=PATIENCE)
     threads = {}
 
     def note(name: str) -> AbstractContextManager[None]:

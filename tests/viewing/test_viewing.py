@@ -37,7 +37,6 @@ from fixtures.tiny import (
     GOLDEN,
     fresh_weights,
     make_simulation_quick,
-    make_streets,
     street,
     without,
 )
@@ -49,16 +48,12 @@ HOSTILE = "</script><img src=x onerror=\"document.title='owned'\">&amp;'\"@@ABOU
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a dataset of six scans, weights, a lone scan, and the page of the six with weights."""
-    root = tmp_path_factory.mktemp("world")
-    make_streets(root / "data")
-    save(fresh_weights(), root / "w.safetensors")
-    street(7, 300)[0].tofile(root / "lone.bin")
-
-    options = ("--weights", root / "w.safetensors", "--scans", 9, "--html", root / "p.html")
-    assert run_cli("view", root / "data", *options) == (0, "")
-    return root
+def path(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a page of the six scans of the dataset, with weights."""
+    html = tmp_path_factory.mktemp("page") / "p.html"
+    options = ("--weights", world / "w.safetensors", "--scans", 9, "--html", html)
+    assert run_cli("view", world / "data", *options) == (0, "")
+    return html
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +85,8 @@ def tags(page: Page) -> list[str]:
 # ---- what the page holds
 
 
-def test_every_scan_is_in_the_page_as_it_is(world: Path, dataset: SemanticKitti) -> None:
-    page = read_page(world / "p.html")
+def test_every_scan_is_in_the_page_as_it_is(path: Path, dataset: SemanticKitti) -> None:
+    page = read_page(path)
     records = dataset.records(dataset.sequences("all"))
     assert scan_names(page) == [record.name for record in records]
 
@@ -107,8 +102,10 @@ def test_every_scan_is_in_the_page_as_it_is(world: Path, dataset: SemanticKitti)
         np.testing.assert_array_equal(planes["truth"], scan.labels)
 
 
-def test_the_page_has_the_labels_of_every_method(world: Path, dataset: SemanticKitti) -> None:
-    page = read_page(world / "p.html")
+def test_the_page_has_the_labels_of_every_method(
+    world: Path, path: Path, dataset: SemanticKitti
+) -> None:
+    page = read_page(path)
     segmenter = amvnet.load(world / "w.safetensors")
     for index, record in enumerate(dataset.records(dataset.sequences("all"))):
         _, planes = page.scan(index)
@@ -120,7 +117,7 @@ def test_the_page_has_the_labels_of_every_method(world: Path, dataset: SemanticK
 
 
 def test_the_page_has_the_probabilities_of_every_method(
-    world: Path, dataset: SemanticKitti
+    world: Path, path: Path, dataset: SemanticKitti
 ) -> None:
     segmentation = amvnet.load(world / "w.safetensors")(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
@@ -129,7 +126,7 @@ def test_the_page_has_the_probabilities_of_every_method(
     assert bev is not None
     scores = {"rv": rv, "bev": bev, "ensemble": np.sqrt(rv * bev), "amvnet": segmentation.scores}
 
-    _, planes = read_page(world / "p.html").scan(0)
+    _, planes = read_page(path).scan(0)
     for method, values in scores.items():
         shares = values / values.sum(axis=1, keepdims=True)
         expected = shares[np.arange(len(shares)), planes[method] - 1]
@@ -154,13 +151,13 @@ def test_the_page_is_as_sure_as_the_result(dataset: SemanticKitti, world: Path) 
     assert (sure[:5] > 0).all()
 
 
-def test_the_table_of_the_page_is_that_of_evaluate(world: Path, tmp_path: Path) -> None:
+def test_the_table_of_the_page_is_that_of_evaluate(world: Path, path: Path, tmp_path: Path) -> None:
     figures = tmp_path / "figures.json"
     options = ("--weights", world / "w.safetensors", "--split", "all", "--json", figures)
     assert run_cli("evaluate", world / "data", *options)[0] == 0
     report = json.loads(figures.read_text())
 
-    table = read_page(world / "p.html").about["table"]
+    table = read_page(path).about["table"]
     assert table["methods"] == ["RV", "BEV", "ensemble", "AMVNet"]
     assert table["scans"] == report["scans"]
     for column, method in enumerate(report["methods"].values()):
@@ -171,7 +168,9 @@ def test_the_table_of_the_page_is_that_of_evaluate(world: Path, tmp_path: Path) 
             assert value == (None if iou is None else pytest.approx(100 * iou, abs=0.06))
 
 
-def test_disagreement_is_one_minus_the_cosine(world: Path, dataset: SemanticKitti) -> None:
+def test_disagreement_is_one_minus_the_cosine(
+    world: Path, path: Path, dataset: SemanticKitti
+) -> None:
     segmenter = amvnet.load(world / "w.safetensors")
     segmentation = segmenter(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
@@ -181,12 +180,12 @@ def test_disagreement_is_one_minus_the_cosine(world: Path, dataset: SemanticKitt
 
     lengths = np.linalg.norm(rv, axis=1) * np.linalg.norm(bev, axis=1)
     expected = 1 - (rv * bev).sum(axis=1) / lengths
-    _, planes = read_page(world / "p.html").scan(0)
+    _, planes = read_page(path).scan(0)
     np.testing.assert_allclose(planes["disagreement"] / 255, expected, atol=0.6 / 255)
 
 
-def test_the_page_names_classes_and_colours_officially(world: Path) -> None:
-    about = read_page(world / "p.html").about
+def test_the_page_names_classes_and_colours_officially(path: Path) -> None:
+    about = read_page(path).about
     assert about["classes"][1:] == list(SEMANTICKITTI.classes)
     np.testing.assert_array_equal(about["colors"][1:], class_colors(SEMANTICKITTI)[1:])
 
@@ -225,6 +224,7 @@ def test_a_huge_scan_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.Monke
     assert "one in 3" in page.about["scans"][0]["note"]
 
 
+@pytest.mark.full
 def test_a_scan_of_120_thousand_points_takes_under_two_megabytes(tmp_path: Path) -> None:
     points, raw = street(0, 120_000)  # in random order, so that they deflate worse than real scans
     truth = SEMANTICKITTI.to_train(raw)
@@ -253,8 +253,8 @@ def test_the_same_scans_give_the_same_bytes(tmp_path: Path) -> None:
 # ---- what the page must not do
 
 
-def test_nothing_is_fetched(world: Path) -> None:
-    text = (world / "p.html").read_text()
+def test_nothing_is_fetched(path: Path) -> None:
+    text = path.read_text()
     for pattern in (
         r"https?:",
         r"\bimport\b\s*[({'\"]",
@@ -266,7 +266,7 @@ def test_nothing_is_fetched(world: Path) -> None:
     ):
         assert not re.search(pattern, text), pattern
 
-    for _, attributes in read_page(world / "p.html").elements:
+    for _, attributes in read_page(path).elements:
         assert not {"src", "srcset", "action", "ping"} & set(attributes)
         assert attributes.get("href") in (None, "data:,")
 
@@ -279,8 +279,8 @@ def policy_of(page: Page) -> dict[str, str]:
     raise AssertionError("expected a policy, found none")
 
 
-def test_no_script_runs_but_the_package_s_own(world: Path) -> None:
-    page = read_page(world / "p.html")
+def test_no_script_runs_but_the_package_s_own(path: Path) -> None:
+    page = read_page(path)
     policy = policy_of(page)
 
     assert policy["default-src"] == "'none'"
@@ -335,11 +335,11 @@ def test_a_lone_scan_needs_nothing_else(world: Path, tmp_path: Path) -> None:
     assert page.texts["<title>"] == "lone.bin"
 
 
-def test_labels_that_predict_wrote_are_shown(world: Path, tmp_path: Path) -> None:
+def test_labels_that_predict_wrote_are_shown(world: Path, path: Path, tmp_path: Path) -> None:
     weights = ("--weights", world / "w.safetensors", "--out", tmp_path / "labels")
     assert run_cli("predict", world / "data", world / "lone.bin", *weights)[0] == 0
 
-    expected = read_page(world / "p.html")
+    expected = read_page(path)
     options = ("--labels", tmp_path / "labels", "--scans", 6)
     page = view_page(tmp_path, world / "data", *options)
     for index in range(6):
@@ -506,45 +506,46 @@ def count_by_class(ids: np.ndarray, hidden: Sequence[int] = ()) -> list[int]:
     return list(counts.tolist())
 
 
-def test_the_browser_hides_classes(world: Path, browser: Browser) -> None:
-    page = world / "p.html"
-    _, planes = read_page(page).scan(0)
+def test_the_browser_hides_classes(path: Path, browser: Browser) -> None:
+    _, planes = read_page(path).scan(0)
     hidden = np.unique(planes["rv"])[:2].tolist()
-    state = browser.state(page, f"color=error&labels=rv&hide={hidden[0]},{hidden[1]}")
+    state = browser.state(path, f"color=error&labels=rv&hide={hidden[0]},{hidden[1]}")
 
     assert state["data-color"] == "error"
     assert state["drawn"] == count_by_class(planes["rv"], hidden)
 
 
-def test_the_browser_draws_only_wrong_points(world: Path, browser: Browser) -> None:
-    page = world / "p.html"
-    _, planes = read_page(page).scan(0)
+@pytest.mark.full
+def test_the_browser_draws_only_wrong_points(path: Path, browser: Browser) -> None:
+    _, planes = read_page(path).scan(0)
     wrong = (planes["truth"] > 0) & (planes["bev"] != planes["truth"])
-    state = browser.state(page, "only=wrong&labels=bev&hide=99&size=nan&color=none")
+    state = browser.state(path, "only=wrong&labels=bev&hide=99&size=nan&color=none")
 
     assert state["drawn"] == count_by_class(planes["bev"][wrong])
 
 
-def test_the_browser_draws_only_uncertain_points(world: Path, browser: Browser) -> None:
-    page = world / "p.html"
-    _, planes = read_page(page).scan(3)
+@pytest.mark.full
+def test_the_browser_draws_only_uncertain_points(path: Path, browser: Browser) -> None:
+    _, planes = read_page(path).scan(3)
     uncertain = planes["uncertain"] > 0
-    state = browser.state(page, "scan=4&labels=truth&only=uncertain&color=height")
+    state = browser.state(path, "scan=4&labels=truth&only=uncertain&color=height")
 
     assert state["data-scan"] == "3"
     assert state["drawn"] == count_by_class(planes["truth"][uncertain])
 
 
-def test_a_click_on_a_class_hides_it(world: Path, tmp_path: Path, browser: Browser) -> None:
-    _, planes = read_page(world / "p.html").scan(0)
+@pytest.mark.full
+def test_a_click_on_a_class_hides_it(path: Path, tmp_path: Path, browser: Browser) -> None:
+    _, planes = read_page(path).scan(0)
     road = SEMANTICKITTI.classes.index("road") + 1
     button = f"document.querySelector('#classes [data-id=\"{road}\"]')"
-    page = with_script(world / "p.html", tmp_path / "p.html", f"{button}.click()")
+    page = with_script(path, tmp_path / "p.html", f"{button}.click()")
 
     state = browser.state(page, "labels=truth")
     assert state["drawn"] == count_by_class(planes["truth"], hidden=[road])
 
 
+@pytest.mark.full
 def test_the_picture_shows_what_is_asked_for_at_its_place(tmp_path: Path, browser: Browser) -> None:
     """From above, x up and y to the left: cars left, green right, wrong labels at the bottom."""
     rng = np.random.default_rng(0)
@@ -576,6 +577,7 @@ def test_the_picture_shows_what_is_asked_for_at_its_place(tmp_path: Path, browse
         assert len(rows) == 0
 
 
+@pytest.mark.full
 def test_a_hostile_name_is_shown_and_not_run(tmp_path: Path, browser: Browser) -> None:
     hostile_page(tmp_path / "p.html")
     state = browser.state(tmp_path / "p.html")
