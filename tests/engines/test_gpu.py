@@ -37,10 +37,9 @@ from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
 from amvnet.models.views.points import PointBatch
 from amvnet.sensors.lidars import Sensor
-from amvnet.weights.file import save
+from amvnet.weights.file import Weights, save
 
 from fixtures.commands import (
-    commands_of,
     fails,
     files,
     run_cli,
@@ -48,6 +47,8 @@ from fixtures.commands import (
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.engines import ScriptedEngine, sure_of
 from fixtures.networks import whole_model
+from fixtures.pages import DocsPage
+from fixtures.sensors import LASERS, place
 from fixtures.tiny import fresh_weights, make_simulation_quick, make_streets, street
 
 N = 15
@@ -152,9 +153,10 @@ def test_neighbours_by_blocks_keep_to_the_rules_for_few_points() -> None:
 
 
 def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compared(
-    simulated_scan: Scan, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    xyz = torch.from_numpy(simulated_scan.points[:, :3].copy())
+    points, _ = place(LASERS["os1-64"], 1.7, steps=1500)
+    xyz = torch.from_numpy(points[:, :3].copy())
     own = permutation(len(xyz))[:4000]
     searched_among_all: list[int] = []
     nearest_of_all = block_search._nearest_of_all
@@ -275,15 +277,24 @@ def test_the_merge_of_a_gpu_is_that_of_a_cpu(monkeypatch: pytest.MonkeyPatch) ->
     assert torch.equal(merge(f, g, nothing, h[:0]), none_refined)
 
 
-def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points(simulated_scan: Scan) -> None:
-    exact = amvnet.load("sim-hdl64e")(simulated_scan)
-    lower = amvnet.load("sim-hdl64e", precision="bfloat16")(simulated_scan)
-
+def check_bfloat16(weights: str | Weights, scan: Scan) -> None:
+    """Check that bfloat16 gives the labels of float32 on nearly all points of a scan."""
+    exact = amvnet.load(weights)(scan)
+    lower = amvnet.load(weights, precision="bfloat16")(scan)
     for name in ("scores", "rv", "bev"):
         assert getattr(lower, name).dtype == np.float32
         assert not np.array_equal(getattr(lower, name), getattr(exact, name))
     assert (lower.labels == exact.labels).mean() > 0.98
     assert (lower.uncertain == exact.uncertain).mean() > 0.97
+
+
+def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points() -> None:
+    check_bfloat16(fresh_weights(), Scan(street(0, 4000)[0]))
+
+
+@pytest.mark.full
+def test_bfloat16_gives_the_labels_of_float32_on_a_simulated_scan(simulated_scan: Scan) -> None:
+    check_bfloat16("sim-hdl64e", simulated_scan)
 
 
 class PrecisionProbe(nn.Module):
@@ -567,30 +578,36 @@ def test_every_command_that_segments_takes_a_precision_and_a_tau(
     assert run_cli(command, *inputs[command], *options) == (0, "")
 
 
+STAND_INS = {
+    "cuda": "cpu",
+    "semantickitti:/data/kitti/dataset": "data",
+    "runs/kitti": "w.safetensors",
+}
+
+
 def test_the_commands_of_the_page_run(
-    world: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Run them on a CPU, and the benchmark in its smallest size."""
+    """Run them on a CPU."""
     monkeypatch.chdir(world)
-    stand_ins = {
-        "cuda": "cpu",
-        "semantickitti:/data/kitti/dataset": "data",
-        "runs/kitti": "w.safetensors",
-        "predictions": str(tmp_path),
-    }
-    predict, evaluate, _, benchmark = commands_of("docs/gpu.md")
+    stand_ins = {**STAND_INS, "predictions": str(tmp_path)}
+    predict, evaluate, *_ = DocsPage("docs/gpu.md").commands
     assert predict[:2] == ["amvnet", "predict"]
     assert evaluate[:2] == ["amvnet", "evaluate"]
     for words in (predict, evaluate):
         assert run_cli(*[stand_ins.get(word, word) for word in words[1:]]) == (0, "")
 
+
+@pytest.mark.full
+def test_the_benchmark_of_the_page_runs(
+    world: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Run it on a CPU, in its smallest size."""
+    monkeypatch.chdir(world)
+    *_, benchmark = DocsPage("docs/gpu.md").commands
     make_simulation_quick(monkeypatch)
     script = Path(__file__).parents[2] / benchmark[1]
     monkeypatch.setattr(sys, "argv", [*benchmark[1:], "--scan", "scans/000000.bin"])
-    capsys.readouterr()
     runpy.run_path(str(script), run_name="__main__")
     printed = capsys.readouterr().out
     for title in ("points to labels", "stages", "predict from disk", "training and validation of"):

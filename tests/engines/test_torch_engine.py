@@ -14,6 +14,7 @@ from torch.nn import functional as F
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.laser_order import with_lasers
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.engines.base import build_model
 from amvnet.engines.torch import TorchEngine
 from amvnet.inference.segmentation import expand_to_scan
@@ -83,15 +84,16 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
     head = model.point_head
     assert head is not None
     index = model.assertion(f, g, batch.points).nonzero()[:, 0]
-    near = torch.from_numpy(nearest_by_scipy(batch.points[:, :3].numpy(), index.numpy()))
+    n = head.config.neighbours
+    near = torch.from_numpy(nearest_by_scipy(batch.points[:, :3].numpy(), index.numpy(), n))
     table = point_table(batch.points, f, g)
     merged = torch.sqrt(f * g)
-    for i, n in zip(index.split(PART), near.split(PART), strict=True):
-        merged[i] = head(*head_features(head.config, table, i, n)).softmax(dim=1)
+    for i, rows in zip(index.split(PART), near.split(PART), strict=True):
+        merged[i] = head(*head_features(head.config, table, i, rows)).softmax(dim=1)
     return expand_to_scan(merged.argmax(dim=1) + 1, scan.valid)
 
 
-def nearest_by_scipy(xyz: np.ndarray, own: np.ndarray, n: int = 15) -> np.ndarray:
+def nearest_by_scipy(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     """Return (U, n) indices of the nearest other points of the points `own` (U,).
 
     Among many points in one place a point may be missing from its own n + 1 nearest; then the
@@ -113,9 +115,27 @@ def weights_and_data() -> list[tuple[str, str]]:
     return pairs
 
 
+def share_of_equal_labels(weights: str | Weights, scan: Scan) -> float:
+    """Return how many labels of a scan are those of the plain model."""
+    segmenter = amvnet.load(weights)
+    # With gradients, layers take their plain ways.
+    with torch.enable_grad(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layers, "linear", F.linear)
+        expected = label_plainly(segmenter.weights, scan)
+    return float((segmenter(scan).labels == expected).mean())
+
+
+@pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES], ids=lambda each: each.name)
+def test_what_makes_a_small_model_fast_leaves_the_labels_as_they_are(taxonomy: Taxonomy) -> None:
+    points = street(0, 4000)[0]
+    scan = Scan(points, ring=np.arange(len(points)) % 32)
+    assert share_of_equal_labels(fresh_weights(taxonomy), scan) >= 0.9999
+
+
+@pytest.mark.full
 @pytest.mark.parametrize(("weights", "data"), weights_and_data())
 def test_what_makes_it_fast_leaves_the_labels_as_they_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: str, data: str
+    tmp_path: Path, weights: str, data: str
 ) -> None:
     if data.startswith("simulated:"):
         pytest.importorskip("embreex")
@@ -128,15 +148,8 @@ def test_what_makes_it_fast_leaves_the_labels_as_they_are(
         step = 20 if data.startswith("semantickitti:") else 4
     dataset = open_dataset(data)
     records = dataset.records(dataset.sequences("all"))[::step][:4]
-    segmenter = amvnet.load(weights)
-
     equal = []
     for record in records:
-        scan = dataset.read(record, labels=False)
-        # With gradients, layers take their plain ways.
-        with torch.enable_grad(), monkeypatch.context() as patch:
-            patch.setattr(layers, "linear", F.linear)
-            expected = label_plainly(segmenter.weights, scan)
-        equal.append((segmenter(scan).labels == expected).mean())
+        equal.append(share_of_equal_labels(weights, dataset.read(record, labels=False)))
     assert equal
     assert np.mean(equal) >= 0.9999

@@ -178,6 +178,7 @@ def test_the_graphs_say_nothing_of_the_machine(exported: Folders) -> None:
             assert word.encode() not in path.read_bytes(), path.name
 
 
+@pytest.mark.full
 def test_one_scan_and_rows_by_ring_do(scans: Path, tmp_path: Path) -> None:
     weights = replace(without(fresh_weights(NUSCENES), "polar_net", "point_head"), sensor="hdl32e")
     path = save(weights, tmp_path / "w.safetensors")

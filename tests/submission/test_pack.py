@@ -17,12 +17,12 @@ from amvnet.submission.rules import rules_for
 from amvnet.weights.file import save
 
 from fixtures.commands import (
-    commands_of,
     fails,
     files,
     run_cli,
 )
 from fixtures.datasets import make_nuscenes
+from fixtures.pages import DocsPage
 from fixtures.submissions import TEST, Case, Entries, measured, read_entries, write_files
 from fixtures.tiny import (
     GOLDEN,
@@ -263,7 +263,7 @@ def test_every_command_of_the_page_runs(
     save(fresh_weights(), tmp_path / "runs/kitti/weights.safetensors")
     save(fresh_weights(NUSCENES), tmp_path / "runs/nuscenes/weights.safetensors")
 
-    commands = commands_of("docs/submission.md")
+    commands = DocsPage("docs/submission.md").commands
     assert len(commands) >= 6
     for command in commands:
         program, *arguments = [word.replace("/data/", f"{tmp_path}/data/") for word in command]
