@@ -35,8 +35,6 @@ from fixtures.tiny import (
     fresh_weights,
     make_streets,
     street,
-    without,
-    write_recipe,
     write_scan,
 )
 
@@ -44,21 +42,11 @@ K = 19
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset, a recipe, fresh weights, and a short run."""
-    root = tmp_path_factory.mktemp("world")
-    make_streets(root / "data")
-    write_recipe(root / "recipe.yaml")
-    save(fresh_weights(), root / "weights.safetensors")
-    options = f"--data {root}/data --out {root}/run --training.head.epochs 4"
-    succeed(f"train {root}/recipe.yaml {options}")
-    return root
-
-
-@pytest.fixture(scope="module")
-def weights(world: Path) -> Weights:
+def weights(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Weights:
     """Networks that have learnt a little, so that their mIoU is above 0."""
-    return load(world / "run")
+    run = tmp_path_factory.mktemp("trained") / "run"
+    succeed(f"train {world}/recipe.yaml --data {world}/data --out {run}")
+    return load(run)
 
 
 @pytest.fixture(scope="module")
@@ -214,9 +202,9 @@ def test_every_method_is_scored_as_by_the_segmenter(
 # ---- the command `analyze`
 
 
-def test_analyze_writes_each_figure_as_picture_and_table(world: Path) -> None:
-    out = world / "figures"
-    succeed(f"analyze {world}/data --weights {world}/weights.safetensors --out {out}")
+def test_analyze_writes_each_figure_as_picture_and_table(world: Path, tmp_path: Path) -> None:
+    out = tmp_path
+    succeed(f"analyze {world}/data --weights {world}/w.safetensors --out {out}")
 
     names = {"classes.csv", "methods.csv"}
     for figure in ("similarity", "distance", "tau"):
@@ -238,15 +226,16 @@ def test_analyze_writes_each_figure_as_picture_and_table(world: Path) -> None:
     ]
 
 
-def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
-    out = world / "swept"
+@pytest.mark.full
+def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path, tmp_path: Path) -> None:
+    out = tmp_path / "swept"
     options = f"--out {out} --neighbours 2,5 --recipe {world}/recipe.yaml"
-    command = f"analyze {world}/data --weights {world}/weights.safetensors {options}"
+    command = f"analyze {world}/data --weights {world}/w.safetensors {options}"
     succeed(command)
     assert column(out / "neighbours.csv", "neighbours") == ["2", "5"]
 
     # The networks are frozen, the heads are not.
-    networks = load(world / "weights.safetensors")
+    networks = load(world / "w.safetensors")
     two = load(out / "neighbours/2/weights.safetensors")
     five = load(out / "neighbours/5/weights.safetensors")
     assert two.model.point_head.neighbours == 2
@@ -266,16 +255,16 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
     assert two_last.stat().st_mtime_ns == two_time
     assert five_last.stat().st_mtime_ns == five_time
 
-    save(fresh_weights(seed=1), world / "other.safetensors")
+    other = save(fresh_weights(seed=1), tmp_path / "other.safetensors")
     assert "networks" in refusal(
-        f"{command} --overwrite".replace("weights.safetensors", "other.safetensors")
+        f"{command} --overwrite".replace(f"{world}/w.safetensors", str(other))
     )
 
 
-def test_taus_are_swept_with_heads_of_their_own(world: Path) -> None:
-    out = world / "taus"
+def test_taus_are_swept_with_heads_of_their_own(world: Path, tmp_path: Path) -> None:
+    out = tmp_path
     options = f"--out {out} --taus 1,0.5 --recipe {world}/recipe.yaml"
-    succeed(f"analyze {world}/data --weights {world}/weights.safetensors {options}")
+    succeed(f"analyze {world}/data --weights {world}/w.safetensors {options}")
     assert column(out / "taus.csv", "tau") == ["0.5", "1.0"]
     assert column(out / "taus.csv", "uncertain %")[1].startswith("100")
 
@@ -287,25 +276,23 @@ def test_taus_are_swept_with_heads_of_their_own(world: Path) -> None:
     assert not torch.equal(half.tensors[name], every.tensors[name])
 
 
-def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
-    save(without(fresh_weights(), "point_head"), world / "headless.safetensors")
-
+def test_wrong_input_of_analyze_is_one_line(world: Path, tmp_path: Path) -> None:
     recipe = f"--recipe {world}/recipe.yaml"
     cases = [
         ("headless", "", "point_head"),
-        ("weights", "--neighbours 3", "--recipe"),
-        ("weights", "--taus 0.5", "--recipe"),
-        ("weights", f"--taus 1.5 {recipe}", "taus"),
-        ("weights", f"--neighbours 3,x {recipe}", "found 'x'"),
-        ("weights", f"--neighbours ² {recipe}", "²"),
-        ("weights", "--neighbours 3 --recipe nonsense", "nonsense"),
-        ("weights", f"--neighbours 3 {recipe} --split all", "both"),
-        ("weights", "--sequences 77", "77"),
+        ("w", "--neighbours 3", "--recipe"),
+        ("w", "--taus 0.5", "--recipe"),
+        ("w", f"--taus 1.5 {recipe}", "taus"),
+        ("w", f"--neighbours 3,x {recipe}", "found 'x'"),
+        ("w", f"--neighbours ² {recipe}", "²"),
+        ("w", "--neighbours 3 --recipe nonsense", "nonsense"),
+        ("w", f"--neighbours 3 {recipe} --split all", "both"),
+        ("w", "--sequences 77", "77"),
     ]
     for name, options, word in cases:
-        arguments = f"--weights {world}/{name}.safetensors --out {world}/none {options}"
+        arguments = f"--weights {world}/{name}.safetensors --out {tmp_path}/none {options}"
         assert word in refusal(f"analyze {world}/data {arguments}")
-    assert not files(world / "none")
+    assert not files(tmp_path)
 
 
 # ---- the command `ablate`
@@ -338,8 +325,11 @@ def test_ablate_scores_on_the_gpu_of_its_process(monkeypatch: pytest.MonkeyPatch
     assert devices == ["cuda:1"] * 4
 
 
-def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -> None:
-    out = world / "ablation"
+@pytest.mark.full
+def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(
+    world: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "ablation"
     options = f"--out {out} --training.rv.epochs 1"
     command = f"ablate {world}/recipe.yaml --data {world}/data {options}"
     succeed(command)
@@ -361,7 +351,7 @@ def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -
     succeed(command)
     assert (out / "ablation.csv").read_text() == text
 
-    make_streets(world / "data2", ("02", "03", "08"))
-    assert "scans" in refusal(command.replace(f"{world}/data", f"{world}/data2"))
+    other = make_streets(tmp_path / "data", ("02", "03", "08"))
+    assert "scans" in refusal(command.replace(f"{world}/data", str(other)))
     for path, end in ends.items():
         assert path.read_bytes()[-1000:] == end

@@ -17,14 +17,15 @@ from torch import nn
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.runtime.distributed import Processes
+from amvnet.runtime.distributed import Processes, dist
 from amvnet.training.loaders import EpochSampler, ScanSet, make_loader
 from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
-from amvnet.weights.file import Weights, load, save
+from amvnet.weights.file import Weights, load
 
 from fixtures.commands import files, run_cli
+from fixtures.marks import with_full, with_quick
 from fixtures.processes import Printed, become_cli, fork_server, start_cli
-from fixtures.tiny import make_streets, without, write_recipe
+from fixtures.tiny import write_recipe
 
 # No DropBlock, as each process draws its own blocks. Double precision, as AdamW divides each
 # gradient by its size, which turns the rounding of a tiny gradient into a full step.
@@ -135,34 +136,22 @@ def free_port() -> int:
         return free.getsockname()[1]
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make streets, a recipe, a run of one process, and its networks without the head."""
-    root = tmp_path_factory.mktemp("world")
-    data = make_streets(root / "data", scans=4)
-    recipe = write_recipe(root / "recipe.yaml", model=MODEL, training=TRAINING)
-    assert run_cli("train", recipe, "--data", data, "--out", root / "run") == (0, "")
-
-    save(without(load(root / "run"), "point_head"), root / "networks.safetensors")
-    return root
-
-
 def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
-    recipe = world / "recipe.yaml"
-    arguments = ["train", recipe, "--data", world / "data", "--out", out, "--stage", stage]
+    """Return the command that trains a stage in a new folder."""
+    out.mkdir()
+    recipe = write_recipe(out / "tiny.yaml", model=MODEL, training=TRAINING)
+    arguments = ["train", recipe, "--data", world / "data", "--out", out / "run", "--stage", stage]
     if stage == "head":
-        arguments += ["--init", world / "networks.safetensors"]
+        arguments += ["--init", world / "headless.safetensors"]
     return arguments
 
 
 @pytest.mark.parametrize(
     ("stage", "launcher"),
-    [
-        ("rv", "launch"),
-        pytest.param("bev", "torchrun", marks=pytest.mark.full),
-        ("head", "srun"),
-        pytest.param("rv", "srun", marks=pytest.mark.full),
-    ],
+    with_quick(
+        [("rv", "launch"), ("bev", "torchrun"), ("head", "srun"), ("rv", "srun")],
+        [("head", "srun")],
+    ),
 )
 def test_two_processes_train_the_weights_of_one(
     world: Path, tmp_path: Path, stage: str, launcher: str
@@ -175,19 +164,24 @@ def test_two_processes_train_the_weights_of_one(
     printed = launchers[launcher](tmp_path, *train_arguments(world, tmp_path / "two", stage))
     assert printed.count("epoch 2/") == 1  # only one of them prints
 
-    weights = load(tmp_path / "two" / stage / "last.safetensors")
-    expected = load(world / "run" / stage / "last.safetensors")
+    assert run_cli(*train_arguments(world, tmp_path / "one", stage)) == (0, "")
+
+    weights = load(tmp_path / "two/run" / stage / "last.safetensors")
+    expected = load(tmp_path / "one/run" / stage / "last.safetensors")
     assert largest_difference(weights, expected) < 1e-5
     part = weights.parts[0]
     assert weights.metrics[part] == pytest.approx(expected.metrics[part])
 
 
-def test_processes_share_the_scans_of_evaluate(world: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("draws", with_full([False, True], [True]))
+def test_processes_share_the_scans_of_evaluate(world: Path, tmp_path: Path, draws: bool) -> None:
     data = world / "data"
-    weights = ["--weights", world / "run"]
+    weights = ["--weights", world / "w.safetensors"]
     for name in ("one", "two"):
         out = tmp_path / name
-        written = ["--json", out / "all.json", "--pictures", out / "pictures"]
+        written = ["--json", out / "all.json"]
+        if draws:
+            written += ["--pictures", out / "pictures"]
         arguments = ["evaluate", data, *weights, "--sequences", "08", *written]
         if name == "one":
             assert run_cli(*arguments) == (0, "")
@@ -208,7 +202,7 @@ def test_work_that_cannot_be_shared_is_refused_in_one_line(
     data = world / "data"
     arguments = {
         "train": [world / "recipe.yaml", "--data", data, "--training.rv.batch", 3],
-        "analyze": [data, "--weights", world / "run"],
+        "analyze": [data, "--weights", world / "w.safetensors"],
     }
     results = slurm(tmp_path, command, *arguments[command], "--out", tmp_path / "out")
     assert [code for code, _ in results] == [2, 2], results
@@ -307,27 +301,13 @@ def test_a_synced_batch_norm_evaluates_like_the_one_it_replaces() -> None:
     assert {"1.weight", "1.running_mean"} <= set(synced.state_dict())
 
 
-DIES = """
-from amvnet.runtime.distributed import Processes, dist
-
-def fail(*_: object, **__: object) -> None:
-    raise RuntimeError("Connection closed by peer")
-
-dist.all_gather_object = fail
-try:
-    Processes(rank=0, size=2).wait()
-except OSError as error:
-    print(error.filename, error.strerror)
-"""
-
-
-def test_the_death_of_another_process_is_one_line() -> None:
+def test_the_death_of_another_process_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is an error of the system, which the command line prints without a traceback."""
-    done = subprocess.run(
-        [sys.executable, "-c", DIES],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "another process ended" in done.stdout
-    assert done.stdout.count("\n") == 1
+
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("Connection closed by peer")
+
+    monkeypatch.setattr(dist, "all_gather_object", fail)
+    with pytest.raises(OSError, match="another process ended") as caught:
+        Processes(rank=0, size=2).wait()
+    assert "\n" not in f"{caught.value.filename} {caught.value.strerror}"
