@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -16,14 +18,17 @@ import numpy as np
 import pytest
 
 from amvnet.data.datasets.open import open_dataset
-from lidarstreets import SimulationError, simulate, writing
+from lidarstreets import LIDAR_MODELS, SimulatedScan, SimulationError, simulate, writing
+from lidarstreets.sensing.sensors import LidarModel
 
-from fixtures.tiny import make_simulation_quick
+from fixtures.tiny import fake_drive, make_simulation_quick
+from fixtures.waiting import wait_for_end
 
 pytest.importorskip("embreex")
 
 LINUX = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
 SCENES = ("simulated-0000", "simulated-0001")
+SETTINGS: dict[str, Any] = {"sensor": "hdl32e", "sequences": 2, "scans": 3, "seed": 2}
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -32,11 +37,36 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+def drive_quickly(
+    model: LidarModel, scans: int, seed: np.random.SeedSequence
+) -> Iterator[SimulatedScan]:
+    """Yield scans of `fake_drive` from a sensor that drives on."""
+    (name,) = (name for name, other in LIDAR_MODELS.items() if other == model)
+    for index, scan in enumerate(fake_drive(name, scans, seed)):
+        pose = np.eye(4)
+        pose[0, 3] = 8.0 * index
+        yield replace(scan, pose=pose, time=float(index))
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `simulate` write scans at once, in this process."""
+    monkeypatch.setattr(writing, "drive_street", drive_quickly)
+
+
 @pytest.fixture(scope="module")
 def nuscenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes of three scans each."""
+    """Two scenes of three scans each, which take no time to simulate."""
     folder = tmp_path_factory.mktemp("nuscenes")
-    return simulate(folder, sensor="hdl32e", sequences=2, scans=3, seed=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(writing, "drive_street", drive_quickly)
+        return simulate(folder, **SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def real_nuscenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two simulated scenes of three scans each."""
+    return simulate(tmp_path_factory.mktemp("nuscenes"), **SETTINGS)
 
 
 def table(folder: Path, name: str) -> list[dict[str, Any]]:
@@ -45,35 +75,39 @@ def table(folder: Path, name: str) -> list[dict[str, Any]]:
     return rows
 
 
-def test_two_processes_write_the_same_bytes_as_one(nuscenes: Path, tmp_path: Path) -> None:
-    again = simulate(tmp_path, sensor="hdl32e", sequences=2, scans=3, seed=2, processes=2)
-    assert digests(again) == digests(nuscenes)
+@pytest.mark.full
+def test_two_processes_write_the_same_bytes_as_one(real_nuscenes: Path, tmp_path: Path) -> None:
+    again = simulate(tmp_path, **SETTINGS, processes=2)
+    assert digests(again) == digests(real_nuscenes)
 
 
-def test_a_stopped_simulation_continues_to_the_same_bytes(nuscenes: Path, tmp_path: Path) -> None:
+def test_a_stopped_simulation_continues_to_the_same_bytes(
+    nuscenes: Path, quick: None, tmp_path: Path
+) -> None:
     def stop_after_four_scans(done: int, total: int) -> None:
         if done == 4:
             raise KeyboardInterrupt
 
-    settings: dict[str, Any] = {"sensor": "hdl32e", "sequences": 2, "scans": 3, "seed": 2}
     with pytest.raises(KeyboardInterrupt):
-        simulate(tmp_path, **settings, progress=stop_after_four_scans)
+        simulate(tmp_path, **SETTINGS, progress=stop_after_four_scans)
 
     counts: list[int] = []
-    simulate(tmp_path, **settings, progress=lambda done, total: counts.append(done))
+    simulate(tmp_path, **SETTINGS, progress=lambda done, total: counts.append(done))
     assert counts == [4, 5, 6]  # the first scene was complete
     assert digests(tmp_path) == digests(nuscenes)
+
+
+SCANS = 1000  # of each sequence, far more than are ever written
 
 
 def run_on_two_processes(out: Path) -> subprocess.Popen[bytes]:
     """Start a long simulation, as the leader of a group of processes; return once it writes."""
     command = [sys.executable, "-m", "lidarstreets", str(out)]
-    options = ["--sequences", "2", "--scans", "1000", "--processes", "2"]
+    options = ["--sequences", "2", "--scans", str(SCANS), "--processes", "2"]
     parent = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, start_new_session=True)
-    deadline = time.monotonic() + 60
     while len(list((out / "sequences").glob("*/labels/000000.label"))) < 2:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+        assert parent.poll() is None
+        time.sleep(0.05)  # only until the files are looked for again
     return parent
 
 
@@ -84,6 +118,7 @@ def workers_of(parent: subprocess.Popen[bytes]) -> list[Path]:
     return [process for process in processes if b"spawn_main" in (process / "cmdline").read_bytes()]
 
 
+@pytest.mark.full
 @LINUX
 def test_no_process_outlives_one_that_was_killed(tmp_path: Path) -> None:
     with run_on_two_processes(tmp_path) as parent:
@@ -91,13 +126,12 @@ def test_no_process_outlives_one_that_was_killed(tmp_path: Path) -> None:
         assert len(workers) == 2
         parent.kill()
 
-    deadline = time.monotonic() + 10
-    while any(map(is_running, workers)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not any(map(is_running, workers))
+    for worker in workers:
+        wait_for_end(int(worker.name))
     assert not list(tmp_path.rglob("*.part*"))
 
 
+@pytest.mark.full
 @LINUX
 def test_each_process_computes_with_one_thread(tmp_path: Path) -> None:
     """A second thread of each waits for the parent to end. Embree would start one a processor."""
@@ -107,22 +141,22 @@ def test_each_process_computes_with_one_thread(tmp_path: Path) -> None:
     assert threads == [2, 2]
 
 
+@pytest.mark.full
 @LINUX
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_to_all_processes_stops_them_at_once_and_leaves_whole_files(
+def test_a_signal_to_all_processes_stops_them_amid_their_scans_and_leaves_whole_files(
     number: signal.Signals, code: int, tmp_path: Path
 ) -> None:
     with run_on_two_processes(tmp_path) as parent:
         workers = workers_of(parent)
         os.killpg(parent.pid, number)
-        start = time.monotonic()
-        _, complaint = parent.communicate(timeout=30)
+        _, complaint = parent.communicate()
 
-    assert time.monotonic() - start < 5  # within one if no other process takes the processors
     assert parent.returncode == code
     assert complaint.count(b"\n") == (number == signal.SIGINT)
     assert not any(map(is_running, workers))
     for folder in (tmp_path / "sequences").iterdir():
+        assert len(list(folder.glob("labels/*"))) < SCANS
         for path in folder.rglob("*.*"):
             assert path.suffix == ".bin" or path.with_suffix(".label").is_file()
     assert not list(tmp_path.rglob("*.part*"))
@@ -142,7 +176,7 @@ def test_a_complete_simulation_is_not_written_again(
 ) -> None:
     monkeypatch.setattr(writing, "drive_street", lambda *_: pytest.fail("simulated again"))
     before = digests(nuscenes)
-    simulate(nuscenes, sensor="hdl32e", sequences=2, scans=3, seed=2)
+    simulate(nuscenes, **SETTINGS)
     assert digests(nuscenes) == before
 
 
@@ -170,8 +204,9 @@ def test_a_folder_with_other_settings_is_refused(nuscenes: Path, other: dict[str
     assert str(nuscenes) in str(caught.value)
 
 
-def test_simulated_nuscenes_is_read_as_the_real_one(nuscenes: Path) -> None:
-    dataset = open_dataset(f"nuscenes:{nuscenes}")
+@pytest.mark.full
+def test_simulated_nuscenes_is_read_as_the_real_one(real_nuscenes: Path) -> None:
+    dataset = open_dataset(f"nuscenes:{real_nuscenes}")
     assert dataset.sequences("all") == SCENES
     classes: set[int] = set()
     for record in dataset.records(SCENES):
@@ -251,7 +286,7 @@ def test_the_files_that_the_tables_name_are_there(nuscenes: Path) -> None:
 
     for row in table(nuscenes, "lidarseg"):
         labels = np.fromfile(nuscenes / row["filename"], np.uint8)
-        assert len(labels) == 32 * 1084
+        assert len(labels) == 500  # of `street`
         assert labels.max() < len(table(nuscenes, "category"))
 
 
@@ -265,7 +300,7 @@ def test_a_robot_does_not_replace_files_that_were_not_simulated(tmp_path: Path, 
     assert path.read_text() == "mine"
 
 
-def test_a_robots_scans_can_be_extended(tmp_path: Path) -> None:
+def test_a_robots_scans_can_be_extended(quick: None, tmp_path: Path) -> None:
     for sequences in (1, 2, 2):
         simulate(tmp_path, sensor="vlp16", sequences=sequences, scans=1)
     assert "val: site_b" in (tmp_path / "robot.yaml").read_text()

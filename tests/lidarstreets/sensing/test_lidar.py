@@ -13,6 +13,8 @@ from lidarstreets.mesh import Mesh, join, part, place, with_random_tint
 from lidarstreets.sensing.sensors import LidarModel
 from lidarstreets.solids import box, hull
 
+from fixtures.examples import first_of
+
 pytest.importorskip("embreex")
 from lidarstreets.sensing import lidar
 from lidarstreets.sensing.lidar import RayScene, trace
@@ -130,6 +132,7 @@ def test_flat_ground_has_the_ranges_of_the_textbook(ground: Points) -> None:
     assert error[near].std() == pytest.approx(HDL64E.range_noise, rel=0.05)
 
 
+@pytest.mark.full
 def test_relief_is_deeper_along_a_ray_that_grazes_it() -> None:
     """Relief is a height: along a ray it is as much deeper as the ray is flatter."""
     corner = 100.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
@@ -151,6 +154,7 @@ def test_relief_is_deeper_along_a_ray_that_grazes_it() -> None:
     assert np.mean(ratios) == pytest.approx(np.log(18 / 6.5), abs=0.4)
 
 
+@pytest.mark.full
 def test_glare_and_loss_come_in_patches_of_a_surface() -> None:
     paint = part([wall(8).triangles], Surface.LIGHT_PAINT, Label.CAR)
     points, _, ring = scan_mesh(paint, replace(EXACT, least_brightness=0.1))
@@ -169,6 +173,7 @@ def test_glare_and_loss_come_in_patches_of_a_surface() -> None:
     assert dark_pairs.sum() / (is_dark[:-1] & same_laser).sum() > 2.5 * share
 
 
+@pytest.mark.full
 def test_the_lower_lasers_tell_how_bright_darker_things_are() -> None:
     lasers = draw_lasers(HDL64E, np.random.default_rng(0))
     assert (lasers.least_brightness[32:] == HDL64E.least_brightness).all()
@@ -240,6 +245,7 @@ def share_through(scene: Mesh) -> float:
     return float((labels[ahead] == Label.BUILDING).mean())
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("without_gaps")
 def test_overlapping_clumps_are_one() -> None:
     """Their union is 4 m deep, not the 2 m at which the first of them ends."""
@@ -247,6 +253,7 @@ def test_overlapping_clumps_are_one() -> None:
     assert share_through(scene) == pytest.approx(np.exp(-4), rel=0.2)
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("without_gaps")
 def test_many_clumps_can_be_passed() -> None:
     clumps = [slab(10 + 2 * i, 11 + 2 * i, 100.0) for i in range(5)]
@@ -266,6 +273,7 @@ def test_some_pulses_pass_a_thin_crown() -> None:
     assert points[(labels == Label.VEGETATION) & is_near_axis, 0].max() < 15.51
 
 
+@pytest.mark.full
 def test_foliage_has_gaps_and_dense_places() -> None:
     """Pulses that enter near one another end at a similar depth, others at very different ones."""
     points, _, _ = scan_mesh(slab(15, 400, 0.1))
@@ -298,7 +306,7 @@ def test_a_hull_is_closed_and_faces_outwards() -> None:
         assert (outward > 0).mean() > 0.99  # a bump of a thin tip may hang over
 
 
-@pytest.mark.parametrize("counter_clockwise", [True, False])
+@pytest.mark.parametrize("counter_clockwise", first_of((True, False)))
 @pytest.mark.parametrize("corrected", [True, False])
 def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(
     corrected: bool, counter_clockwise: bool
@@ -323,6 +331,7 @@ def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(
     np.testing.assert_allclose(ahead[:, 0], 20, atol=0.02)
 
 
+@pytest.mark.full
 def test_a_body_has_one_brightness_and_bodies_differ() -> None:
     rng = np.random.default_rng(1)
     rights = range(-16, 16)  # y of the right edges of 32 walls, 1 m wide each
@@ -345,6 +354,7 @@ def test_a_body_has_one_brightness_and_bodies_differ() -> None:
     assert np.mean(np.divide(deviations, medians)) < reflection.spread
 
 
+@pytest.mark.full
 def test_far_grazing_ground_is_darker(ground: Points) -> None:
     points, _ = ground
     distance = np.linalg.norm(points[:, :2], axis=1)
@@ -353,6 +363,7 @@ def test_far_grazing_ground_is_darker(ground: Points) -> None:
     assert far < 0.6 * near
 
 
+@pytest.mark.full
 def test_lasers_differ_in_gain_and_the_upper_ones_see_near_surfaces_darker() -> None:
     lasers = draw_lasers(HDL64E, np.random.default_rng(0))
     assert lasers.gain.shape == lasers.near_loss.shape == (64,)
@@ -372,6 +383,7 @@ def test_lasers_differ_in_gain_and_the_upper_ones_see_near_surfaces_darker() -> 
     assert brightness(far[far_ring >= 32]) == pytest.approx(brightness(far[far_ring < 32]), rel=0.1)
 
 
+@pytest.mark.full
 def test_each_laser_measures_a_wall_with_an_error_of_its_own() -> None:
     sensor = replace(EXACT, range_error=0.05)
     errors = draw_lasers(sensor, np.random.default_rng(3)).range_error
@@ -386,6 +398,7 @@ def test_each_laser_measures_a_wall_with_an_error_of_its_own() -> None:
         assert np.allclose(distance - to_the_wall, errors[ring], atol=1e-3)
 
 
+@pytest.mark.full
 def test_a_laser_sees_near_things_from_its_own_height() -> None:
     """Points of one laser lie on a line that begins at its height, at any range."""
     sensor = replace(EXACT, origins=HDL64E.origins)
@@ -405,6 +418,7 @@ def brightness(points: np.ndarray) -> float:
     return float(points[points[:, 3] > 0, 3].mean())
 
 
+@pytest.mark.full
 def test_brightness_is_half_at_half_the_range_and_weak_returns_have_none() -> None:
     """A dark wall 40 m away is at the limit; the same wall 10 m away is not."""
     fading = replace(EXACT, half_range=40.0)
@@ -444,6 +458,7 @@ def test_the_shots_that_the_car_blocks_return_from_its_roof() -> None:
         assert set(labels[within_car]) == {0, Label.CAR}
 
 
+@pytest.mark.full
 def test_a_factor_on_a_surface_changes_its_brightness_alone() -> None:
     brick = replace(wall(10), surface=np.full(2, Surface.BRICK, np.uint8))
     sensor = replace(EXACT, gamma=2.0, gain=0.5)

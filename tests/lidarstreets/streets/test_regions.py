@@ -28,7 +28,7 @@ def test_factors_name_what_exists(region: str) -> None:
 def test_a_region_changes_how_often_a_kind_of_street_is_drawn() -> None:
     def share_of(kind: str, region: Region) -> float:
         rng = np.random.default_rng(0)
-        return float(np.mean([draw_style(rng, region).kind == kind for _ in range(2000)]))
+        return float(np.mean([draw_style(rng, region).kind == kind for _ in range(1000)]))
 
     urban = STREET_KINDS["urban"].share
     doubled = 2 * urban / (1 + urban)
