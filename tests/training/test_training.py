@@ -758,7 +758,7 @@ def train_until_signal(words: list[str], printed: Printed, number: int) -> None:
         if trainer.current_epoch == 1:
             os.kill(os.getpid(), number)
 
-    SeedBatches.on_train_batch_start = signalled  # type: ignore[method-assign]
+    SeedBatches.on_train_batch_start = signalled  # type: ignore[assignment, method-assign]
     become_cli(words, printed)
 
 
