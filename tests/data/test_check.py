@@ -16,6 +16,7 @@ from amvnet.data.taxonomy import UNKNOWN
 
 from fixtures.commands import run_cli, succeed
 from fixtures.datasets import MAKERS
+from fixtures.examples import first_of
 from fixtures.scan_writers import some_points
 from fixtures.tiny import make_streets, write_recipe
 
@@ -57,6 +58,18 @@ def write_labels(path: Path, raw: np.ndarray) -> None:
     raw.astype(np.uint32).tofile(path)
 
 
+each_command = pytest.mark.parametrize("command", first_of(("check", "train")))
+
+
+def refusal(command: str, data: Path) -> str:
+    """Check data that must be refused, or start a training with them; return the message."""
+    if command == "train":
+        return train(data)
+    code, error = run_cli("check", data)
+    assert code == 2
+    return error
+
+
 def train(data: Path) -> str:
     """Start a training that must be refused before it makes its folder; return its line."""
     recipe = write_recipe(data.parent / "recipe.yaml")
@@ -92,36 +105,41 @@ def test_the_counts_of_a_benchmark_are_those_of_its_scans(name: str, tmp_path: P
     np.testing.assert_array_equal(report.count_points(records), expected)
 
 
-def test_every_unknown_id_is_found_before_a_training(data: Path) -> None:
+@each_command
+def test_every_unknown_id_is_found_before_a_training(data: Path, command: str) -> None:
     raw = RAW.copy()
     raw[:5], raw[5:8] = 55, 1000
     write_labels(data.parent / "c/1.label", raw)  # of a scan to validate with
     write_labels(data.parent / "a/0.label", np.where(np.arange(60) == 0, 55, RAW))
-    for error in (train(data), run_cli("check", data)[1]):
-        assert "55 (6 points in 2 scans, such as" in error
-        assert f"1000 (3 points in 1 scan, such as {data.parent / 'c/1.label'})" in error
-        assert "ignored: rest" in error
+    error = refusal(command, data)
+    assert "55 (6 points in 2 scans, such as" in error
+    assert f"1000 (3 points in 1 scan, such as {data.parent / 'c/1.label'})" in error
+    assert "ignored: rest" in error
 
 
-def test_labels_without_a_class_or_of_one_class_are_not_trained_on(data: Path) -> None:
+@each_command
+def test_labels_without_a_class_or_of_one_class_are_not_trained_on(
+    data: Path, command: str
+) -> None:
     for site in ("a", "b"):
         for index in range(2):
             write_labels(data.parent / f"{site}/{index}.label", np.full(60, 40))
-    assert "all ignored" in train(data)
+    assert "all ignored" in refusal(command, data)
 
     for site in ("a", "b"):
         for index in range(2):
             write_labels(data.parent / f"{site}/{index}.label", np.where(RAW == 7, 3, RAW))
-    assert "only ground" in train(data)
+    assert "only ground" in refusal(command, data)
 
     describe(data.parent, classes={"ground": [3, 7]})
-    assert "two or more classes" in train(data)
+    assert "two or more classes" in refusal(command, data)
 
 
-def test_nothing_to_validate_with_is_refused(data: Path) -> None:
+@each_command
+def test_nothing_to_validate_with_is_refused(data: Path, command: str) -> None:
     for index in range(2):
         write_labels(data.parent / f"c/{index}.label", np.full(60, 40))
-    assert "validate" in train(data)
+    assert "validate" in refusal(command, data)
 
 
 def test_missing_label_files_are_skipped_and_counted(
@@ -152,6 +170,12 @@ def test_broken_scans_are_named_and_the_others_are_checked(
     assert "found 2 broken scans" in error
     assert "4 scans" not in error
     assert str(3 * np.count_nonzero(RAW == 3)) in capsys.readouterr().out
+
+
+@pytest.mark.full
+def test_no_training_starts_with_broken_scans(data: Path) -> None:
+    (data.parent / "a/1.npy").write_bytes(b"no array")
+    np.save(data.parent / "c/0.npy", np.full((60, 4), np.nan))
     line = train(data)
     assert "found 2 of 6 scans that cannot" in line
     assert "a/1.npy" in line

@@ -474,7 +474,11 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("inputs", "code", "written"), [(("data", "scans"), 3, 11), (("data",), 0, 6)]
+    ("inputs", "code", "written"),
+    [
+        (("data", "scans"), 3, 11),
+        pytest.param(("data",), 0, 6, marks=pytest.mark.full),
+    ],
 )
 def test_predicting_three_at_a_time_writes_what_one_at_a_time_does(
     world: Path, tmp_path: Path, inputs: tuple[str, ...], code: int, written: int

@@ -23,12 +23,13 @@ from amvnet.models.methods import MethodName
 from amvnet.weights.file import load
 
 from fixtures.commands import fails, files
+from fixtures.exports import shallow_weights
 from fixtures.tiny import fresh_weights
 
 TENSORRT = "TensorrtExecutionProvider"
 CUDA = "CUDAExecutionProvider"
 CPU = "CPUExecutionProvider"
-WEIGHTS = fresh_weights()
+WEIGHTS = shallow_weights()
 
 
 @pytest.fixture(scope="module", autouse=True)

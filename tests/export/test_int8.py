@@ -28,6 +28,7 @@ from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY
 from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails, files, succeed
+from fixtures.exports import shallow_weights
 from fixtures.tiny import fresh_weights, street, without
 
 POINTS = 3000
@@ -54,7 +55,7 @@ class Kernel:
 def weights(graphs_converted_once: None) -> Weights:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library)
-    return without(fresh_weights(), "point_head")
+    return without(shallow_weights(), "point_head")
 
 
 @pytest.fixture(scope="module")
@@ -138,14 +139,17 @@ def test_convolutions_hold_integers_nearest_to_their_weights(exported: Folders, 
     assert in_float32 == (["stem.0.weight"] if name == "range_net" else [])
 
 
-def test_the_gru_stays_in_float32(exported: Folders) -> None:
-    model = load_model(exported.int8, "range_net")
+@pytest.mark.full
+def test_the_gru_stays_in_float32(weights: Weights, scans: Path, tmp_path: Path) -> None:
+    deep = without(fresh_weights(), "polar_net", "point_head")
+    onnx_export.export(deep, tmp_path, int8=str(scans))
+    model = load_model(tmp_path, "range_net")
     nodes = nodes_by_output(model)
     layers = [node for node in model.graph.node if node.op_type == "GRU"]
     assert layers
     for layer in layers:
-        for weights in layer.input[1:3]:
-            assert weights not in nodes or nodes[weights].op_type != "DequantizeLinear"
+        for stored in layer.input[1:3]:
+            assert stored not in nodes or nodes[stored].op_type != "DequantizeLinear"
 
 
 def test_the_description_says_which_graphs_are_in_int8(exported: Folders, scans: Path) -> None:
@@ -238,6 +242,7 @@ def test_calibrating_for_a_sensor_that_cannot_be_simulated_is_one_line(
     check_refused(weights, int8_export.SIMULATED, tmp_path, "scans of this sensor to amvnet export")
 
 
+@pytest.mark.full
 def test_graphs_that_change_too_many_labels_are_one_line(
     weights: Weights, scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

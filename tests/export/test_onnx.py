@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 import amvnet
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.data.taxonomy import NUSCENES
 from amvnet.export import onnx as onnx_export
 from amvnet.export.onnx import describe_export
 from amvnet.models.methods import BOTH_NETWORKS, MethodName
@@ -47,6 +47,8 @@ from fixtures.commands import (
     run_cli,
     succeed,
 )
+from fixtures.examples import first_of
+from fixtures.exports import shallow_weights
 from fixtures.pages import DocsPage
 from fixtures.tiny import fresh_weights, street, without
 
@@ -57,10 +59,12 @@ OF_TENSORRT = (
     "Add BatchNormalization Clip Concat Conv Div GRU Gemm LeakyRelu Log MaxPool Mul ReduceMax Relu "
     "Reshape Resize Slice Split Transpose"
 )
-TAXONOMIES = {"elevation": SEMANTICKITTI, "ring": NUSCENES}  # by the rows of `fresh_weights`
-each_rows = pytest.mark.parametrize(
-    "rows", ["elevation", pytest.param("ring", marks=pytest.mark.full)]
-)
+WEIGHTS: dict[str, Callable[[], Weights]] = {
+    "shallow": shallow_weights,
+    "deep": fresh_weights,
+    "by ring": lambda: fresh_weights(NUSCENES),
+}
+each_export = pytest.mark.parametrize("name", first_of(WEIGHTS))
 
 
 @dataclass(frozen=True)
@@ -72,19 +76,19 @@ class Export:
 
 
 class Exports(dict[str, Export]):
-    """Exports by what the rows of the range image are, each made when a test first needs it."""
+    """Exports by the names of `WEIGHTS`, each made when a test first needs it."""
 
     def __init__(self, make_folder: Callable[[str], Path]) -> None:
         super().__init__()
         self._make_folder = make_folder
 
-    def __missing__(self, rows: str) -> Export:
-        weights = fresh_weights(TAXONOMIES[rows])
-        folder = self._make_folder(rows)
+    def __missing__(self, name: str) -> Export:
+        weights = WEIGHTS[name]()
+        folder = self._make_folder("graphs")
         graphs = onnx_export.export(weights, folder)
         assert 0 <= max(graph["difference"] for graph in graphs.values()) <= 1e-4
-        self[rows] = Export(weights, folder)
-        return self[rows]
+        self[name] = Export(weights, folder)
+        return self[name]
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +101,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: No
 @pytest.fixture
 def folder(exported: Exports, tmp_path: Path) -> Path:
     """A copy that a test may break."""
-    return shutil.copytree(exported["elevation"].folder, tmp_path / "copy")
+    return shutil.copytree(exported["shallow"].folder, tmp_path / "copy")
 
 
 def make_scan(seed: int, count: int = POINTS) -> Scan:
@@ -110,16 +114,16 @@ def make_scan(seed: int, count: int = POINTS) -> Scan:
     return Scan(points, ring=rng.integers(0, 16, count))
 
 
-@each_rows
+@each_export
 @pytest.mark.parametrize("count", [6, 700, POINTS])
-def test_the_runner_says_what_torch_says(exported: Exports, rows: str, count: int) -> None:
+def test_the_runner_says_what_torch_says(exported: Exports, name: str, count: int) -> None:
     scan = make_scan(count, count)
-    expected = amvnet.load(exported[rows].weights)(scan)
+    expected = amvnet.load(exported[name].weights)(scan)
     assert expected.uncertain.any()
     if count == POINTS:
         assert not expected.uncertain[scan.valid].all()
 
-    actual = OnnxSegmenter(exported[rows].folder)(scan.points, scan.ring)
+    actual = OnnxSegmenter(exported[name].folder)(scan.points, scan.ring)
     same = expected.uncertain == actual.uncertain
     assert same.mean() >= 0.9999
     assert (expected.labels == actual.labels).mean() >= 0.9999
@@ -130,16 +134,16 @@ def test_the_runner_says_what_torch_says(exported: Exports, rows: str, count: in
     assert not actual.scores[~scan.valid].any()
 
 
-@each_rows
-def test_the_networks_alone_say_what_torch_says(exported: Exports, rows: str) -> None:
+@each_export
+def test_the_networks_alone_say_what_torch_says(exported: Exports, name: str) -> None:
     scan = make_scan(7)
     valid = scan.valid
-    expected = amvnet.load(exported[rows].weights)(scan)
+    expected = amvnet.load(exported[name].weights)(scan)
     assert scan.ring is not None
     assert expected.rv is not None
     assert expected.bev is not None
 
-    runner = OnnxSegmenter(exported[rows].folder)
+    runner = OnnxSegmenter(exported[name].folder)
     f = runner.score_range_view(scan.select(valid))
     g = runner.score_polar_view(scan.points[valid])
     assert np.abs(f - expected.rv[valid]).max() <= 1e-4
@@ -152,7 +156,7 @@ def test_other_methods_say_what_torch_says(
 ) -> None:
     change(folder, "method", to=method)
     scan = make_scan(3)
-    expected = amvnet.load(exported["elevation"].weights, method=method)(scan)
+    expected = amvnet.load(exported["shallow"].weights, method=method)(scan)
     actual = OnnxSegmenter(folder)(scan.points)
     assert (expected.labels == actual.labels).mean() >= 0.9999
     assert (expected.uncertain == actual.uncertain).mean() >= 0.9999
@@ -161,7 +165,7 @@ def test_other_methods_say_what_torch_says(
 def test_matched_intensities_are_in_the_description(exported: Exports, folder: Path) -> None:
     quantiles = SIMULATED_QUANTILES["hdl64e"]
     records = {part: {MATCHED_KEY: True, QUANTILES_KEY: list(quantiles)} for part in BOTH_NETWORKS}
-    weights = replace(exported["elevation"].weights, training=records)
+    weights = replace(exported["shallow"].weights, training=records)
     description = describe_export(weights, "amvnet", read_description(folder)["graphs"])
     assert description["intensity"] == {
         "probabilities": list(PROBABILITIES),
@@ -175,7 +179,7 @@ def test_matched_intensities_are_in_the_description(exported: Exports, folder: P
     same = expected.uncertain == actual.uncertain
     assert same.mean() >= 0.9999
     assert np.abs(expected.scores - actual.scores)[same].max() <= 1e-4
-    unmatched = amvnet.load(exported["elevation"].weights)(scan)
+    unmatched = amvnet.load(exported["shallow"].weights)(scan)
     assert np.abs(expected.scores - unmatched.scores).max() > 0.001
 
 
@@ -196,10 +200,10 @@ def change(folder: Path, *keys: str, to: object) -> None:
     (folder / "amvnet.json").write_text(json.dumps(description))
 
 
-@each_rows
-def test_the_description_says_what_a_program_needs(exported: Exports, rows: str) -> None:
-    description = read_description(exported[rows].folder)
-    taxonomy = TAXONOMIES[rows]
+@each_export
+def test_the_description_says_what_a_program_needs(exported: Exports, name: str) -> None:
+    description = read_description(exported[name].folder)
+    taxonomy = exported[name].weights.taxonomy
     names = []
     for train_id, described in enumerate(description["classes"]):
         names.append(described["name"])
@@ -207,9 +211,9 @@ def test_the_description_says_what_a_program_needs(exported: Exports, rows: str)
         assert tuple(described["color"]) == taxonomy.colors[train_id]
     assert names[1:] == list(taxonomy.classes)
 
-    model = exported[rows].weights.model
+    model = exported[name].weights.model
     assert description["sensor"] == "tiny"
-    assert description["range_view"]["rows"] == rows
+    assert description["range_view"]["rows"] == model.range_view.rows
     assert len(description["range_channels"]) == 6
     assert len(description["polar_features"]) == 9
     assert description["assertion"]["threshold"] == model.assertion.threshold
@@ -227,38 +231,38 @@ def test_the_description_says_what_a_program_needs(exported: Exports, rows: str)
     assert graphs["polar_scores"]["outputs"][0]["shape"] == ["pillars", 4 * taxonomy.size]
 
 
-@each_rows
-def test_the_description_is_that_of_the_graphs(exported: Exports, rows: str) -> None:
+@each_export
+def test_the_description_is_that_of_the_graphs(exported: Exports, name: str) -> None:
     import onnx
 
-    folder = exported[rows].folder
+    folder = exported[name].folder
     description = read_description(folder)
-    for name, graph in description["graphs"].items():
+    for graph_name, graph in description["graphs"].items():
         model = onnx.load(folder / graph["file"])
         opsets = {opset.domain: opset.version for opset in model.opset_import}
-        assert opsets[""] == description["opset"], name
+        assert opsets[""] == description["opset"], graph_name
         check_values(graph["inputs"], model.graph.input)
         check_values(graph["outputs"], model.graph.output)
 
 
-@each_rows
-def test_tensorrt_takes_the_graphs(exported: Exports, rows: str) -> None:
+@each_export
+def test_tensorrt_takes_the_graphs(exported: Exports, name: str) -> None:
     import onnx
 
-    folder = exported[rows].folder
-    for name, graph in read_description(folder)["graphs"].items():
+    folder = exported[name].folder
+    for graph_name, graph in read_description(folder)["graphs"].items():
         model = onnx.load(folder / graph["file"])
         onnx.checker.check_model(model, full_check=True)
         weights = {tensor.name for tensor in model.graph.initializer}
         for node in model.graph.node:
             assert not node.domain
-            assert node.op_type in OF_TENSORRT.split(), name
+            assert node.op_type in OF_TENSORRT.split(), graph_name
             # Kernels have to be constants, and positions of maxima are not returned.
             assert node.op_type != "Conv" or set(node.input[1:]) <= weights
             assert node.op_type != "MaxPool" or len(node.output) == 1
-        if name in ("range_net", "polar_map"):
+        if graph_name in ("range_net", "polar_map"):
             sizes = model.graph.input[0].type.tensor_type.shape.dim
-            assert all(size.HasField("dim_value") for size in sizes), name
+            assert all(size.HasField("dim_value") for size in sizes), graph_name
 
 
 def check_values(described: list[dict[str, Any]], values: Any) -> None:
@@ -271,26 +275,10 @@ def check_values(described: list[dict[str, Any]], values: Any) -> None:
 
 
 def test_the_graphs_say_nothing_of_the_machine(exported: Exports) -> None:
-    for path in exported["elevation"].folder.iterdir():
+    for path in exported["shallow"].folder.iterdir():
         data = path.read_bytes()
         for word in (str(PROJECT), sys.prefix, "site-packages"):
             assert word.encode() not in data, path.name
-
-
-SESSION = """
-import onnx
-from onnx import TensorProto, helper
-
-values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in "xy"]
-node = helper.make_node("Relu", ["x"], ["y"])
-graph = helper.make_graph([node], "g", values[:1], values[1:])
-opset = helper.make_opsetid("", 18)
-model = helper.make_model(graph, opset_imports=[opset], ir_version=8)
-
-from pathlib import Path
-from amvnet.onnx_runner import open_session
-open_session(Path("a"), model.SerializeToString(), ["CPUExecutionProvider"])
-"""
 
 
 def test_intensities_that_are_not_matched_are_not_in_the_description() -> None:
@@ -299,20 +287,20 @@ def test_intensities_that_are_not_matched_are_not_in_the_description() -> None:
     assert describe_export(weights, "amvnet", {})["intensity"] is None
 
 
-def test_onnx_runtime_reports_nothing_and_writes_nothing(tmp_path: Path) -> None:
-    """It keeps what it would report in the user's cache, with an identifier of the machine."""
-    environment = {name: text for name, text in os.environ.items() if name != "CI"}
-    environment.pop("ORT_DISABLE_TELEMETRY", None)
-    for name in ("HOME", "TMPDIR", "XDG_CACHE_HOME"):
-        environment[name] = str(tmp_path)
-    subprocess.run([sys.executable, "-c", SESSION], env=environment, check=True)
-    assert not list(tmp_path.iterdir())
-
-
 # ---- the runner
 
 
-def test_the_runner_needs_no_torch(exported: Exports, tmp_path: Path) -> None:
+def test_the_runner_needs_no_torch_and_onnx_runtime_reports_nothing(
+    exported: Exports, tmp_path: Path
+) -> None:
+    """ONNX Runtime keeps what it would report in the user's cache, with an id of the machine."""
+    home = tmp_path / "home"
+    home.mkdir()
+    environment = {name: text for name, text in os.environ.items() if name != "CI"}
+    environment.pop("ORT_DISABLE_TELEMETRY", None)
+    for name in ("HOME", "TMPDIR", "XDG_CACHE_HOME"):
+        environment[name] = str(home)
+
     points = tmp_path / "points.npy"
     labels = tmp_path / "labels.npy"
     scan = make_scan(5)
@@ -322,12 +310,13 @@ import sys
 sys.modules["torch"] = None  # an import fails
 import numpy as np
 from amvnet.onnx_runner import OnnxSegmenter
-result = OnnxSegmenter({str(exported["elevation"].folder)!r})(np.load({str(points)!r}))
+result = OnnxSegmenter({str(exported["shallow"].folder)!r})(np.load({str(points)!r}))
 np.save({str(labels)!r}, result.labels)
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
-    expected = amvnet.load(exported["elevation"].weights)(scan).labels
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+    expected = amvnet.load(exported["shallow"].weights)(scan).labels
     assert (np.load(labels) == expected).mean() >= 0.9999
+    assert not list(home.iterdir())
 
 
 def test_pooling_is_the_maximum_of_each_pillar() -> None:
@@ -421,14 +410,14 @@ def test_a_wrong_description_is_one_line(
 
 @pytest.mark.full
 def test_missing_and_wrong_rings_are_one_line(exported: Exports) -> None:
-    by_ring = OnnxSegmenter(exported["ring"].folder)
+    by_ring = OnnxSegmenter(exported["by ring"].folder)
     points = make_scan(0, 10).points[:4]
     fails(lambda: by_ring(points), "ring index")
     fails(lambda: by_ring(points, np.full(4, 99)), "0 to 31")
 
 
 def test_wrong_scans_are_one_line(exported: Exports) -> None:
-    by_elevation = OnnxSegmenter(exported["elevation"].folder)
+    by_elevation = OnnxSegmenter(exported["shallow"].folder)
     points = make_scan(0, 10).points[:4]
     fails(lambda: by_elevation(points[:, :3]), "(N, 4)")
     fails(lambda: by_elevation(np.full((3, 4), np.nan)), "finite")
@@ -438,7 +427,7 @@ def test_wrong_scans_are_one_line(exported: Exports) -> None:
 
 
 def test_the_command_exports_one_network(exported: Exports, tmp_path: Path) -> None:
-    weights = without(exported["elevation"].weights, "range_net", "point_head")
+    weights = without(exported["shallow"].weights, "range_net", "point_head")
     path = save(weights, tmp_path / "w.safetensors")
     succeed(f"export --weights {path} --out {tmp_path}/out")
     assert files(tmp_path / "out") == {
@@ -452,7 +441,7 @@ def test_the_command_exports_one_network(exported: Exports, tmp_path: Path) -> N
 
 
 def test_mistakes_of_the_command_are_one_line(exported: Exports, tmp_path: Path) -> None:
-    weights = exported["elevation"].weights
+    weights = exported["shallow"].weights
     polar_only = save(without(weights, "range_net", "point_head"), tmp_path / "polar.safetensors")
     head_only = save(without(weights, "range_net", "polar_net"), tmp_path / "head.safetensors")
     (tmp_path / "file").write_text("")
@@ -475,7 +464,7 @@ def test_a_graph_that_differs_leaves_no_files(
         return inputs, outputs, result + channels.view(shape)
 
     monkeypatch.setattr(onnx_export, "_run", run_wrongly)
-    weights = without(exported["elevation"].weights, "range_net", "point_head")
+    weights = without(exported["shallow"].weights, "range_net", "point_head")
     fails(lambda: onnx_export.export(weights, tmp_path), "polar_points", "difference")
     assert not list(tmp_path.iterdir())
 
@@ -498,9 +487,10 @@ def test_the_runner_without_its_runtime_says_the_command(
     fails(lambda: OnnxSegmenter(folder), "pip install onnxruntime")
 
 
+@pytest.mark.full
 def test_the_page_runs(exported: Exports, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    polar_only = without(exported["elevation"].weights, "range_net", "point_head")
+    polar_only = without(exported["shallow"].weights, "range_net", "point_head")
     save(polar_only, tmp_path / "weights.safetensors")
     (tmp_path / "scans").mkdir()
     for path in ("scan.bin", "scans/0.bin"):

@@ -42,9 +42,9 @@ def test_the_papers_point_head_has_18500_parameters_and_costs_one_gmac_for_10000
 
     width = 2 * 19 + 4
     with FlopCounterMode(display=False) as counter:
-        logits = head(torch.zeros(10_000, width), torch.zeros(10_000, 15, width))
-    assert logits.shape == (10_000, 19)
-    assert counter.get_total_flops() / 2 == pytest.approx(1e9, rel=0.05)
+        logits = head(torch.zeros(500, width), torch.zeros(500, 15, width))
+    assert logits.shape == (500, 19)
+    assert counter.get_total_flops() / 2 * (10_000 / 500) == pytest.approx(1e9, rel=0.05)
 
 
 def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> None:

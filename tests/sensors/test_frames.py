@@ -16,6 +16,7 @@ from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
 
 from fixtures.commands import fails
+from fixtures.examples import first_of
 from fixtures.sensors import LASERS, place
 from fixtures.tiny import fresh_weights
 
@@ -64,7 +65,7 @@ def test_axes_and_millimetres_are_recognised_and_said(axes: str, unit: float) ->
 
 
 @pytest.mark.parametrize("tilt", [(8, 0), (-8, 0), (0, 8), (0, -8), (6, -12)])
-@pytest.mark.parametrize("axes", ["x-forward", "z-forward"])
+@pytest.mark.parametrize("axes", first_of(["z-forward", "x-forward"]))
 def test_a_tilted_scan_is_levelled(tilt: tuple[float, float], axes: str) -> None:
     xyz = scan_xyz()
     scan, line = normalise(in_axes(tilted(xyz, *tilt), axes))
@@ -76,7 +77,7 @@ def test_a_tilted_scan_is_levelled(tilt: tuple[float, float], axes: str) -> None
     assert "--rotate 0," in line
 
 
-@pytest.mark.parametrize("rise", [1.73, 1.5, 3.4])
+@pytest.mark.parametrize("rise", first_of([1.5, 1.73, 3.4]))
 @pytest.mark.parametrize("options", [{}, {"height": 1.73}, {"offset": (0, 0, -1.73)}])
 def test_an_origin_on_the_ground_or_below_it_is_mended(
     rise: float, options: dict[str, Any]
@@ -154,7 +155,7 @@ def test_a_raised_road_is_not_upside_down() -> None:
     assert frame.height == pytest.approx(1.7, abs=0.05)
 
 
-@pytest.mark.parametrize("tilt", [(8, 0), (0, 8)])
+@pytest.mark.parametrize("tilt", first_of([(8, 0), (0, 8)]))
 def test_scans_that_sway_are_levelled_one_by_one(tilt: tuple[float, float]) -> None:
     normaliser = normaliser_for(WEIGHTS)
     pitch, roll = tilt

@@ -39,7 +39,7 @@ from amvnet.weights.file import save
 from lidarstreets import LIDAR_MODELS
 
 from fixtures.commands import fails, files, run_cli
-from fixtures.examples import with_examples
+from fixtures.examples import first_of, with_examples
 from fixtures.scan_writers import pcd_bytes, write_bag1
 from fixtures.sensors import LASERS, ground_height, place
 from fixtures.tiny import fresh_weights, make_streets
@@ -53,7 +53,7 @@ NUSCENES_WEIGHTS = fresh_weights(NUSCENES)
 
 
 @pytest.mark.parametrize("name", LASERS)
-@pytest.mark.parametrize("height", [0.6, 1.73, 2.6])
+@pytest.mark.parametrize("height", first_of([0.6, 1.73, 2.6]))
 def test_lasers_field_of_view_and_height_are_measured(name: str, height: float) -> None:
     points, laser = place(LASERS[name], height)
     by_laser = np.argsort(laser, kind="stable")
@@ -158,7 +158,7 @@ def test_a_given_height_counts_whatever_the_ground_says() -> None:
 
 
 @pytest.mark.parametrize("axes", AXES)
-@pytest.mark.parametrize("turn", [(0, 0, 0), (90, 0, 0), (30, 10, -5)])
+@pytest.mark.parametrize("turn", first_of([(30, 10, -5), (0, 0, 0), (90, 0, 0)]))
 def test_any_frame_that_is_described_gives_the_same_scan(
     axes: str, turn: tuple[float, float, float]
 ) -> None:

@@ -251,6 +251,7 @@ def test_from_scans_without_labels_to_an_archive(tmp_path: Path) -> None:
 # --- the page of the documentation ---
 
 
+@pytest.mark.full
 def test_every_command_of_the_page_runs(
     cases: dict[str, Case], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
