@@ -1,6 +1,7 @@
 # Everything runs in the virtual environment .venv.
 PYTHON ?= python3
 BIN := .venv/bin
+EXTRAS ?= simulate,formats,export,test
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # Each processor runs one process with one thread. One process runs all tests of a file, because they share what they make.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
@@ -55,7 +56,7 @@ release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushin
 	@$(PYTHON) -m venv .venv
 	@$(PIP) torch
 	@echo "installing amvnet and what its tests need: a minute, or several with a slow connection"
-	@$(PIP) --editable ".[simulate,formats,export,test]"
+	@$(PIP) --editable ".[$(EXTRAS)]"
 	@touch $@
 
 # These packages take 600 MB, so `make test` does not need them.
