@@ -142,7 +142,7 @@ def test_a_users_file_stays_and_nothing_is_written(name: str, world: Path, tmp_p
     assert files(tmp_path) == {case.file}
 
 
-@pytest.mark.parametrize("name", with_full(CASES, SLOW))
+@pytest.mark.parametrize("name", with_full(CASES, SLOW + ALIKE))
 def test_an_earlier_file_of_the_same_kind_is_replaced_if_the_user_says_so(
     name: str, world: Path, tmp_path: Path
 ) -> None:
@@ -199,7 +199,7 @@ READ = {
 }
 
 
-@pytest.mark.parametrize("is_hard", [False, True])
+@pytest.mark.parametrize("is_hard", with_full([False, True], [True]))
 @pytest.mark.parametrize("name", READ)
 def test_no_output_is_an_input(name: str, is_hard: bool, world: Path, tmp_path: Path) -> None:
     command, output, read = READ[name]

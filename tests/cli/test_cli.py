@@ -26,6 +26,7 @@ from fixtures.commands import (
     run_cli,
     succeed,
 )
+from fixtures.marks import with_quick
 from fixtures.tiny import GOLDEN
 
 OVERALL = {"miou", "miou_present", "accuracy", "fwiou", "iou"}
@@ -168,7 +169,36 @@ MISTAKES = {
 RUN_FILES = {"out/recipe.yaml", "out/run.yaml", "out/class_counts.npz"}  # written at once
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
+# The others are found at the same places of the code.
+QUICK_MISTAKES = (
+    "unknown command",
+    "no weights",
+    "an argument too many",
+    "unknown method",
+    "truncated scan",
+    "weights that are no weights",
+    "missing data",
+    "no prediction of a scan",
+    "output is a file",
+    "same name twice",
+    "weights of other classes",
+    "init of other classes for the head",
+    "weights without head",
+    "missing sequence",
+    "wrong label count",
+    "training on validation data",
+    "head without networks",
+    "unknown key in a recipe",
+    "recipe that is no text",
+    "no epochs",
+    "unknown accelerator",
+    "sizes that do not fit each other",
+    "figures below a file",
+    "nothing to time",
+)
+
+
+@pytest.mark.parametrize("mistake", with_quick(MISTAKES, QUICK_MISTAKES))
 def test_a_mistake_is_one_line_and_leaves_nothing(
     mistake: str, world: Path, wrong: Path, tmp_path: Path
 ) -> None:
@@ -290,7 +320,7 @@ def test_scores_are_both_networks_probabilities_in_half_precision(
             assert np.array_equal(arrays[name], probabilities.astype(np.float16))
 
 
-@pytest.mark.parametrize("method", ["rv", "bev", "ensemble"])
+@pytest.mark.parametrize("method", with_quick(["rv", "bev", "ensemble"], ["ensemble"]))
 def test_weights_without_head_predict_by_the_other_methods(
     method: str, world: Path, tmp_path: Path
 ) -> None:
@@ -353,7 +383,7 @@ def test_pictures_are_drawn_and_nothing_else_is_left(scored: Path) -> None:
         assert path.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("method", ["rv", "bev", "ensemble", "amvnet"])
+@pytest.mark.parametrize("method", with_quick(["rv", "bev", "ensemble", "amvnet"], ["amvnet"]))
 def test_predictions_score_as_the_weights_that_made_them(
     method: str, world: Path, scored: Path, tmp_path: Path
 ) -> None:

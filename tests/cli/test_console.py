@@ -18,7 +18,8 @@ from amvnet import progress
 from amvnet.cli import console
 from amvnet.progress import QUIET_SECONDS
 
-from fixtures.marks import with_quick
+from fixtures.commands import files
+from fixtures.marks import with_full, with_quick
 from fixtures.processes import PATIENCE
 
 PROGRESS_LINE = r"segmenting: (\d+) of \d+, .*, \d+:\d\d:\d\d left"
@@ -117,16 +118,24 @@ def amvnet(shell: str, **environment: str) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
+# `submit` needs no torch, whose import takes seconds.
+COMMANDS = {
+    "submit": "{w}/data --predictions {w}/predictions --split val --out {out}/entry.zip",
+    "predict": "{w}/lone.bin --weights {w}/w.safetensors --out {out}",
+}
+WRITTEN = {"submit": {"entry.zip"}, "predict": {"lone.label"}}
 SINKS = ("> /dev/full", "| true", ">&-", "> /dev/full 2> /dev/full")
 
 
-# Each takes the seconds of an import of torch.
-@pytest.mark.parametrize("sink", with_quick(SINKS, ["> /dev/full"]))
-def test_the_work_goes_on_without_a_reader(sink: str, world: Path, tmp_path: Path) -> None:
-    command = f"$AMVNET predict {world}/lone.bin --weights {world}/w.safetensors --out {tmp_path}"
-    code, _, error = amvnet(f"set -o pipefail; {command} {sink}")
+@pytest.mark.parametrize("sink", with_quick(SINKS, SINKS[:2]))
+@pytest.mark.parametrize("command", with_full(COMMANDS, ["predict"]))
+def test_the_work_goes_on_without_a_reader(
+    command: str, sink: str, world: Path, tmp_path: Path
+) -> None:
+    words = COMMANDS[command].format(w=world, out=tmp_path)
+    code, _, error = amvnet(f"set -o pipefail; $AMVNET {command} {words} {sink}")
     assert code == 0
-    assert {path.name for path in tmp_path.glob("*.label")} == {"lone.label"}
+    assert files(tmp_path) == WRITTEN[command]
     expected = "stdout cannot be written" if sink == "> /dev/full" else ""
     assert error.count("\n") == bool(expected)
     assert expected in error

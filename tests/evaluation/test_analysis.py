@@ -35,18 +35,26 @@ from fixtures.tiny import (
     fresh_weights,
     make_streets,
     street,
+    write_recipe,
     write_scan,
 )
 
 K = 19
+STREET = ("car", "road", "sidewalk", "building")  # the classes of the points
+LAST_BIASES = ("range_net.scores.bias", "polar_net.scores.bias", "point_head.fc.1.bias")
 
 
 @pytest.fixture(scope="module")
-def weights(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Weights:
-    """Networks that have learnt a little, so that their mIoU is above 0."""
-    run = tmp_path_factory.mktemp("trained") / "run"
-    succeed(f"train {world}/recipe.yaml --data {world}/data --out {run}")
-    return load(run)
+def weights() -> Weights:
+    """Networks that tend to the classes of the streets, so that many labels are right."""
+    weights = fresh_weights()
+    found = [SEMANTICKITTI.classes.index(name) for name in STREET]
+    tensors = dict(weights.tensors)
+    for name in LAST_BIASES:
+        bias = tensors[name].clone()
+        bias.view(-1, K)[:, found] += 2
+        tensors[name] = bias
+    return replace(weights, tensors=tensors)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +113,7 @@ def test_a_swept_tau_gives_what_weights_with_that_tau_give(
     assert uncertain == pytest.approx(100 * share, abs=0.2)
     assert miou == pytest.approx(100 * expected["miou"], abs=0.2)
     assert accuracy == pytest.approx(100 * expected["accuracy"], abs=0.2)
-    assert miou > 2
+    assert accuracy > 10  # far from nothing
 
 
 def test_points_that_no_network_sees_count_as_evaluate_counts_them(
@@ -262,8 +270,9 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path, tmp_path
 
 
 def test_taus_are_swept_with_heads_of_their_own(world: Path, tmp_path: Path) -> None:
-    out = tmp_path
-    options = f"--out {out} --taus 1,0.5 --recipe {world}/recipe.yaml"
+    out = tmp_path / "out"
+    recipe = write_recipe(tmp_path / "short.yaml", training={"head": {"epochs": 1, "points": 200}})
+    options = f"--out {out} --taus 1,0.5 --recipe {recipe}"
     succeed(f"analyze {world}/data --weights {world}/w.safetensors {options}")
     assert column(out / "taus.csv", "tau") == ["0.5", "1.0"]
     assert column(out / "taus.csv", "uncertain %")[1].startswith("100")

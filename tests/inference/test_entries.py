@@ -242,7 +242,7 @@ def no_warnings() -> Iterator[None]:
         yield
 
 
-QUICK = ("plain", "all kinds of lost returns", "without intensities", "in double precision")
+QUICK = ("plain", "all kinds of lost returns", "without intensities")
 
 
 @pytest.mark.parametrize("name", with_quick(SCANS, QUICK))

@@ -323,6 +323,7 @@ def head(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.full
 def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(
     world: Path, head: Path, tmp_path: Path
 ) -> None:

@@ -38,6 +38,7 @@ from fixtures.commands import (
     run_cli,
     succeed,
 )
+from fixtures.marks import with_quick
 from fixtures.sensors import LASERS, place
 from fixtures.tiny import fresh_weights, street
 
@@ -68,7 +69,10 @@ def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]
 # ---- two sensors in one folder
 
 
-@pytest.mark.parametrize(("first", "second"), [("vlp16", "os1-64"), ("os1-64", "hdl32e")])
+@pytest.mark.parametrize(
+    ("first", "second"),
+    with_quick([("vlp16", "os1-64"), ("os1-64", "hdl32e")], [("vlp16", "os1-64")]),
+)
 def test_if_the_first_scans_of_a_folder_differ_each_is_measured_alone(
     tmp_path: Path, first: str, second: str
 ) -> None:
