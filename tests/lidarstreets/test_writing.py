@@ -104,7 +104,13 @@ def run_on_two_processes(out: Path) -> subprocess.Popen[bytes]:
     """Start a long simulation, as the leader of a group of processes; return once it writes."""
     command = [sys.executable, "-m", "lidarstreets", str(out)]
     options = ["--sequences", "2", "--scans", str(SCANS), "--processes", "2"]
-    parent = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, start_new_session=True)
+    parent = subprocess.Popen(
+        [*command, *options],
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        # Tests that a shell started in the background ignore SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     while len(list((out / "sequences").glob("*/labels/000000.label"))) < 2:
         assert parent.poll() is None
         time.sleep(0.05)  # only until the files are looked for again
