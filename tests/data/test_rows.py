@@ -390,7 +390,7 @@ def test_the_folders_of_a_pattern_are_read_once_for_each_any_folders(
     has_circles: bool, table: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path
-    for _ in range(8):
+    for _ in range(6):
         folder /= "d"
         folder.mkdir()
         if has_circles:

@@ -152,6 +152,7 @@ def test_the_gru_stays_in_float32(weights: Weights, scans: Path, tmp_path: Path)
             assert stored not in nodes or nodes[stored].op_type != "DequantizeLinear"
 
 
+@pytest.mark.full
 def test_the_description_says_which_graphs_are_in_int8(exported: Folders, scans: Path) -> None:
     graphs = json.loads((exported.int8 / "amvnet.json").read_text())["graphs"]
     for name, graph in graphs.items():
