@@ -51,3 +51,12 @@ def test_the_readme_names_every_extra() -> None:
     readme = (ROOT / "README.md").read_text()
     for extra in project["optional-dependencies"]:
         assert f"`{extra}`" in readme
+
+
+def test_the_page_in_the_browser_has_less_than_1500_lines_of_code() -> None:
+    lines: list[str] = []
+    for path in (ROOT / "docs" / "try").rglob("*.js"):
+        if "node_modules" not in path.parts:
+            lines += path.read_text().splitlines()
+    code = [line for line in lines if line.strip() and not re.match(r"\s*(//|/?\*)", line)]
+    assert len(code) < 1500

@@ -6,7 +6,6 @@ import gzip
 import importlib.util
 import json
 import os
-import re
 import shutil
 import subprocess
 import threading
@@ -40,7 +39,7 @@ ROOT = Path(__file__).parents[2]
 DRIVER = ROOT / "tests" / "fixtures" / "try_page.mjs"
 PLAYWRIGHT = ROOT / "docs" / "try" / "node_modules" / "playwright-core"
 NODE = shutil.which("node")
-TIMEOUT = 1500  # seconds: five scans on a machine that does much else
+TIMEOUT = 1500  # seconds: a safety net; no outcome depends on it
 MEGABYTE = 1_000_000
 AGREEMENT = 0.999  # least share of the points with the labels of `onnx_runner.py`
 OWN = "mine"  # the folder of own weights beside the page
@@ -67,6 +66,7 @@ MISSING = [
     if is_missing
 ]
 pytestmark = [
+    pytest.mark.full,
     # CI has all of it.
     pytest.mark.skipif(
         bool(MISSING) and "CI" not in os.environ, reason=f"missing: {', '.join(MISSING)}"
@@ -316,10 +316,12 @@ def test_steps_have_times_and_the_line_says_what_was_assumed(session: Session) -
 
 
 def test_the_page_answers_while_it_labels_and_draws_slowly(session: Session) -> None:
+    """It runs timers meanwhile. If it waited for a picture, it would run the next one after it."""
     result = session.results["slow"]
     assert result["state"] == "labelled"
-    assert result["longestWait"] < result["pictureTime"]
-    assert result["moving"] < result["pictureTime"]
+    assert result["rounds"] > 20
+    assert len(result["answers"]) == result["pictures"] + 3
+    assert min(result["answers"]) > 1
 
 
 def test_a_scan_is_drawn_once(session: Session) -> None:
@@ -366,7 +368,6 @@ def test_a_newer_request_ends_the_work_on_an_older_one(plain: dict[str, Any]) ->
     assert folders == {WEIGHTS["nuscenes"], OWN}  # the older request needs the other weights
 
 
-@pytest.mark.full
 def test_webgpu_gives_the_labels_of_the_cpu(folder: Path, session: Session, tmp_path: Path) -> None:
     with served(folder, ISOLATION) as site:
         case = {"file": str(session.files["own"]), "model": 2}
@@ -374,12 +375,3 @@ def test_webgpu_gives_the_labels_of_the_cpu(folder: Path, session: Session, tmp_
     if "on the GPU" not in result["line"]:
         pytest.skip("Chromium offers no WebGPU in software here")
     check_labels(result, np.fromfile(session.results["own"]["label"], np.uint32))
-
-
-def test_the_page_has_less_than_1500_lines_of_code() -> None:
-    lines: list[str] = []
-    for path in (ROOT / "docs" / "try").rglob("*.js"):
-        if "node_modules" not in path.parts:
-            lines += path.read_text().splitlines()
-    code = [line for line in lines if line.strip() and not re.match(r"\s*(//|/?\*)", line)]
-    assert len(code) < 1500
