@@ -61,6 +61,17 @@ def signal_handlers_are_kept() -> Iterator[None]:
     assert [signal.getsignal(number) for number in ending] == before
 
 
+@pytest.fixture
+def hears_sigint() -> Iterator[None]:
+    """Let this process, and those that the test starts, hear SIGINT.
+
+    They ignore it if a shell has started the tests in the background.
+    """
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture(scope="session")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Return the folder of `make_world`, which no test may change."""

@@ -69,6 +69,7 @@ CASES = [("predict", end) for end in ENDS]
 CASES += [(command, "SIGTERM") for command in COMMANDS if command != "predict"]
 
 
+@pytest.mark.usefixtures("hears_sigint")
 @pytest.mark.parametrize(("command", "end"), CASES)
 def test_the_exit_code_of_every_command(
     command: str, end: str, monkeypatch: pytest.MonkeyPatch
@@ -118,6 +119,7 @@ sys.exit(main.main())
 """
 
 
+@pytest.mark.usefixtures("hears_sigint")
 @pytest.mark.parametrize("number", with_full([signal.SIGTERM, signal.SIGINT], [signal.SIGINT]))
 def test_a_command_that_does_not_end_is_ended(number: int, tmp_path: Path) -> None:
     """It leaves no half file, and says one line."""
@@ -312,6 +314,7 @@ sys.exit(main())
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("hears_sigint")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_process_that_is_stopped_goes_on(number: int, world: Path, tmp_path: Path) -> None:
     script = WAITING.replace("{written}", str(WRITTEN))

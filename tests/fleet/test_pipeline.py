@@ -30,10 +30,16 @@ from amvnet.inference.request import LabellingRequest  # noqa: E402
 from amvnet.weights.file import load, save  # noqa: E402
 
 from fixtures.commands import fails, refusal, run_cli  # noqa: E402
-from fixtures.s3_server import Bucket, slow_labels  # noqa: E402
+from fixtures.processes import PATIENCE  # noqa: E402
+from fixtures.s3_server import Bucket, held_labels  # noqa: E402
 from fixtures.tiny import fresh_weights  # noqa: E402
 
-pytestmark = pytest.mark.full
+pytestmark = [
+    pytest.mark.full,
+    # `connect` ignores it too, for the process of a command.
+    pytest.mark.filterwarnings("ignore:`ray_remote_args` is deprecated"),
+]
+WRITTEN = 8  # label files that are written before a run is stopped; some blocks are then whole
 
 CLI = """
 import sys
@@ -164,11 +170,12 @@ def test_what_is_killed_is_made_up_for(
     """With SIGKILL, in the middle of a run."""
     out = f"kill-{what}"
     words = command(fleet, f"s3://fleet/{out}")
-    with slow_labels(0.5):
+    with held_labels(WRITTEN) as go_on:
         process = start(words)
         if what == "worker":
             wait_for(lambda: any(key.endswith(".label") for key in bucket.keys(out)), process)
             os.kill(workers_of(process.pid)[0], signal.SIGKILL)
+            go_on()
         else:
             wait_for(lambda: any("part-" in key for key in bucket.keys(out)), process)
             process.kill()
@@ -186,12 +193,13 @@ def test_what_is_killed_is_made_up_for(
     check_complete(bucket, out, labels)
 
 
+@pytest.mark.usefixtures("hears_sigint")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_and_its_workers_with_one_line(
     fleet: Path, bucket: Bucket, number: int
 ) -> None:
     out = f"stop-{number}"
-    with slow_labels(0.5):
+    with held_labels(WRITTEN):
         process = subprocess.Popen(
             [sys.executable, "-c", CLI, *command(fleet, f"s3://fleet/{out}")],
             stdout=subprocess.DEVNULL,
@@ -201,13 +209,13 @@ def test_a_signal_ends_the_run_and_its_workers_with_one_line(
         wait_for(lambda: any("part-" in key for key in bucket.keys(out)), process)
         workers = workers_of(process.pid)
         process.send_signal(number)
-        _, error = process.communicate(timeout=60)
+        _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 128 + number
     lines = [line for line in error.splitlines() if line.startswith("amvnet")]
     assert lines == ["amvnet: stopped; go on with --resume"]
     assert "Traceback" not in error
 
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE  # comes only if workers outlive the run
     while any(Path(f"/proc/{worker}").exists() for worker in workers):
         assert time.monotonic() < deadline, "workers outlive the run"
         time.sleep(0.5)
@@ -218,7 +226,7 @@ def start(words: list[str]) -> subprocess.Popen[bytes]:
 
 
 def wait_for(is_reached: Callable[[], bool], process: subprocess.Popen[Any]) -> None:
-    """Wait until a run has come so far."""
+    """Wait until a run has come so far, which it does before it is over, as labels are held."""
     while not is_reached():
         assert process.poll() is None, "the run was over before it was killed"
         time.sleep(0.2)
