@@ -429,7 +429,7 @@ def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, text: str, 
 
 def test_the_journal_is_at_most_as_late_as_the_writing(tmp_path: Path) -> None:
     """Scans that are written are in the journal when the next but one is segmented."""
-    lines = []
+    lines: list[int] = []
     counter = Counter()
     scans = counted_scans(8, counter)
 

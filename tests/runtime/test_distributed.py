@@ -17,7 +17,7 @@ from torch import nn
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.runtime.distributed import Processes, dist
+from amvnet.runtime.distributed import Processes
 from amvnet.training.loaders import EpochSampler, ScanSet, make_loader
 from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.weights.file import Weights, load
@@ -307,7 +307,7 @@ def test_the_death_of_another_process_is_one_line(monkeypatch: pytest.MonkeyPatc
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError("Connection closed by peer")
 
-    monkeypatch.setattr(dist, "all_gather_object", fail)
+    monkeypatch.setattr(torch.distributed, "all_gather_object", fail)
     with pytest.raises(OSError, match="another process ended") as caught:
         Processes(rank=0, size=2).wait()
     assert "\n" not in f"{caught.value.filename} {caught.value.strerror}"
