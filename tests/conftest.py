@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 
 from amvnet.engines import onnx as onnx_engine
 from amvnet.engines import precision
@@ -20,6 +21,12 @@ from fixtures.submissions import MAKERS, Case
 from fixtures.world import make_world, state_of
 
 LASERS = 16
+
+# How long an example takes decides nothing.
+settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("any machine")
 
 
 def _random_scan(count: int, seed: int = 0) -> Scan:

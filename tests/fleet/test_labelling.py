@@ -227,7 +227,8 @@ def test_scans_beside_a_fault_are_normalised_as_their_drive(
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
-@settings(deadline=None, max_examples=50)
+@pytest.mark.full
+@settings(max_examples=50)
 @given(name=NAMES, drive=NAMES, kind=st.sampled_from(["label", "npy", "ply"]), link=LINKS)
 def test_names_in_a_manifest_write_nothing_elsewhere(
     labelling: LabellingRequest, name: str, drive: str, kind: str, link: str
@@ -310,6 +311,7 @@ def test_a_full_disk_is_fatal(
     assert row["error"] == "/full/000000.label: No space left on device"
 
 
+@pytest.mark.full
 def test_a_bucket_that_takes_no_labels_is_fatal(
     labelling: LabellingRequest, fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -266,6 +266,7 @@ class MadeUp(Place):
         return MadeUp(f"{self.address}/{name}", self.filesystem, f"{self.path}/{name}")
 
 
+@pytest.mark.full
 def test_the_memory_of_planning_does_not_grow_with_the_names(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -81,7 +81,7 @@ def test_every_value_arrives(through: Callable[..., Any], height: int) -> None:
     np.testing.assert_array_equal(packed[:, 2::-1], colors)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seconds=st.integers(0, 2**31 - 1),
     nanoseconds=st.integers(0, 10**9 - 1),
