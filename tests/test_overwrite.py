@@ -123,7 +123,7 @@ SLOW = ("pictures", "analyze", "table")  # they draw
 ALIKE = ("npy", "ply", "scores", "uncertain", "dataset")  # they are like `predict`
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", with_full(CASES, ALIKE))
 def test_a_users_file_stays_and_nothing_is_written(name: str, world: Path, tmp_path: Path) -> None:
     case = CASES[name]
     mine = tmp_path / case.file

@@ -269,6 +269,7 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path, tmp_path
     )
 
 
+@pytest.mark.full
 def test_taus_are_swept_with_heads_of_their_own(world: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     recipe = write_recipe(tmp_path / "short.yaml", training={"head": {"epochs": 1, "points": 200}})

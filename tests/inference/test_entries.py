@@ -30,7 +30,7 @@ from amvnet.weights.file import save
 from amvnet_ros.segmentation import CloudSegmenter, Settings
 
 from fixtures.commands import fails, succeed
-from fixtures.marks import with_quick
+from fixtures.marks import with_full, with_quick
 from fixtures.scan_writers import cloud_message
 from fixtures.tiny import (
     fresh_weights,
@@ -310,7 +310,7 @@ def test_negative_intensities_are_named_with_their_number(saved: World) -> None:
     fails(partial(saved.segmenter, with_negative_intensities()), *OF_LOST_RETURNS)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("value", with_full([np.nan, np.inf], [np.inf]))
 def test_intensities_that_are_all_lost_are_none(saved: World, value: float) -> None:
     points = plain()
     points[:, 3] = value
@@ -327,7 +327,7 @@ def of_lost_returns(name: str) -> np.ndarray:
     return np.array([LOST[name]] * 100, np.float32)
 
 
-@pytest.mark.parametrize("name", OF_PLACES)
+@pytest.mark.parametrize("name", with_quick(OF_PLACES, ["at the origin", "not a number"]))
 def test_a_scan_of_lost_returns_alone_is_refused_by_every_entry(saved: World, name: str) -> None:
     points = of_lost_returns(name)
     fails(partial(saved.segmenter, points), "expected points to segment")

@@ -19,6 +19,7 @@ from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 
 from fixtures.commands import fails, files, run_cli
+from fixtures.marks import with_quick
 from fixtures.scan_writers import some_points, write_bag1, write_pcd
 
 COUNT = 60
@@ -229,7 +230,7 @@ def failure(world: Path, out: Path, *words: object) -> str:
     return message
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", with_quick(KINDS, ["ply"]))
 def test_predict_writes_the_points_of_the_file_though_the_network_gets_others(
     kind: str, world: Path, recorded: Path, tmp_path: Path
 ) -> None:

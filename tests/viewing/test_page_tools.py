@@ -15,6 +15,8 @@ from fixtures.browser_pages import Browser, browser, read_page, with_script
 
 __all__ = ["browser"]
 
+pytestmark = pytest.mark.full  # each starts a browser
+
 PERSON = SEMANTICKITTI.classes.index("person") + 1
 BOX = (-5.0, 0.0, -9.0, 5.0, 8.0, 1.5)
 
@@ -39,7 +41,6 @@ def in_box(page: Path) -> np.ndarray:
     return np.asarray(((xyz >= BOX[:3]) & (xyz <= BOX[3:])).all(axis=1))
 
 
-@pytest.mark.full
 def test_only_points_in_the_box_are_drawn(page: Path, browser: Browser) -> None:
     _, planes = read_page(page).scan(0)
     state = browser.state(page, f"box={','.join(map(str, BOX))}")
@@ -50,14 +51,12 @@ def test_only_points_in_the_box_are_drawn(page: Path, browser: Browser) -> None:
     assert state["console"] == []
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("box", ["1,2,3", "a,b,c,d,e,f", "", "1,,,,,nan"])
 def test_a_box_that_is_none_hides_nothing(page: Path, browser: Browser, box: str) -> None:
     state = browser.state(page, f"box={box}")
     assert sum(state["drawn"]) == 2000
 
 
-@pytest.mark.full
 def test_corrected_labels_are_saved_as_predict_writes_them(
     page: Path, tmp_path: Path, browser: Browser
 ) -> None:
@@ -79,7 +78,6 @@ def test_corrected_labels_are_saved_as_predict_writes_them(
     assert state["drawn"][PERSON] == in_box(page).sum()
 
 
-@pytest.mark.full
 def test_a_scan_that_is_not_whole_cannot_be_corrected(tmp_path: Path, browser: Browser) -> None:
     points = np.array([[1, 2, 0, 0], [np.nan, 0, 0, 0], [3, 4, 0, 0]], np.float32)
     valid = np.array([True, False, True])
@@ -103,7 +101,6 @@ def test_the_tape_measures_metres(page: Path, tmp_path: Path, browser: Browser) 
     assert f"{expected:.2f} m" in state["dom"].texts["length"]
 
 
-@pytest.mark.full
 def test_a_picture_and_the_table_cause_no_error(
     page: Path, tmp_path: Path, browser: Browser
 ) -> None:
@@ -117,7 +114,6 @@ def test_a_picture_and_the_table_cause_no_error(
     assert "open" in table
 
 
-@pytest.mark.full
 def test_an_error_of_the_page_is_noticed(page: Path, tmp_path: Path, browser: Browser) -> None:
     state = browser.state(with_script(page, tmp_path / "p.html", "nothing()"))
     assert len(state["console"]) == 1
