@@ -1,7 +1,7 @@
 # Everything runs in the virtual environment .venv.
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS ?= simulate,formats,export,test
+EXTRAS ?= simulate,formats,export,drives,test
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # Each processor runs one process with one thread. One process runs all tests of a file, because they share what they make.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile

@@ -44,7 +44,7 @@ def main() -> None:
     points = 0
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record, labels=False)
-        labels, uncertain = labels_by_method(segmenter, scan, PAPER_METHODS)
+        labels, uncertain, _ = labels_by_method(segmenter, scan, PAPER_METHODS)
         assert uncertain is not None
         uncertain_points += int(uncertain.sum())
         points += len(scan)

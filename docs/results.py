@@ -16,7 +16,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs/results.json"
-PRINTED_METHODS = ("rv", "bev", "plain", "ensemble", "amvnet")
+PRINTED_METHODS = ("rv", "bev", "plain", "ensemble", "amvnet", "drive")
 REGION = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.S)
 
 
@@ -63,8 +63,8 @@ PAGES = {
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as a table in Markdown; the best method of each row is in bold."""
     lines = [
-        "| Scans | Weights | RV | BEV | Plain ensemble | Ensemble | AMVNet | Uncertain |",
-        "|---|---|---|---|---|---|---|---|",
+        "| Scans | Weights | RV | BEV | Plain ensemble | Ensemble | AMVNet | Drive | Uncertain |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         best = max(row[method] for method in PRINTED_METHODS if method in row)

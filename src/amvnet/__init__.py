@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from amvnet.data.datasets.simulated import simulate as simulate
     from amvnet.engines.base import Engine
     from amvnet.errors import InputError as InputError
+    from amvnet.inference.drive import drive as drive
     from amvnet.inference.fuse import fuse as fuse
     from amvnet.inference.listing import read as read
     from amvnet.inference.listing import read_all as read_all
@@ -40,6 +41,7 @@ _MODULES = {
     "Segmentation": "amvnet.inference.segmentation",
     "Segmenter": "amvnet.inference.segmenter",
     "Weights": "amvnet.weights.file",
+    "drive": "amvnet.inference.drive",
     "fuse": "amvnet.inference.fuse",
     "push": "amvnet.weights.push",
     "read": "amvnet.inference.listing",

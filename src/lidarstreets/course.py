@@ -17,7 +17,8 @@ CAR_PARK_SHARE = 0.04
 TURNING_SHARE = 0.14
 ROAD_EDGE_SHARE = 0.12
 LONGEST_DETOUR = 50.0  # longest course that may leave the lane, metres along the street
-# Change of the phase of the sensor's sway, and of its turn, from scan to scan, radians.
+SPACING = 8.0  # distance between two scans, metres, if nothing else is asked for
+# Change of the phase of the sensor's sway, and of its turn, over this distance, radians.
 SWAY_STEP = 0.7
 TURN_STEP = 1.3
 HALF_CAR_WIDTH = 1.0  # half the width of the car that carries the sensor, metres
@@ -35,7 +36,7 @@ class Drive:
         speed: smallest and largest speed, metres per second.
     """
 
-    spacing: float = 8.0
+    spacing: float = SPACING
     margin: float = 90.0
     scans_per_street: int = 40
     speed: tuple[float, float] = (5.0, 12.0)
@@ -73,14 +74,15 @@ class Course:
 
     def pose_at(self, index: int) -> tuple[float, float, float]:
         """Return (x, y, yaw) of the sensor at scan `index`, in metres and radians."""
-        sway = self.sway * math.sin(index * SWAY_STEP)
+        steps = index * (self.spacing / SPACING)
+        sway = self.sway * math.sin(steps * SWAY_STEP)
         if self.side_road is not None:
             along = self.start - index * self.spacing
             x, y, yaw = self.side_road.pose_at(along, self.t + sway)
             return x, y, yaw + math.pi
 
         x, y, yaw = self.ground.pose_at(self.start + index * self.spacing, self.t + sway)
-        return x, y, yaw + self.turn * math.cos(index * TURN_STEP)
+        return x, y, yaw + self.turn * math.cos(steps * TURN_STEP)
 
     def places(self, scans: int) -> np.ndarray:
         """Return x and y of the sensor at the first `scans` scans: (scans, 2), metres."""

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarstreets.course import SPACING, Drive
 from lidarstreets.drive import drive_street
 from lidarstreets.errors import SimulationError
 from lidarstreets.layouts import LAYOUTS, WRITE_LOCK, write_whole
@@ -26,6 +27,7 @@ Progress = Callable[[int, int], None]  # called with the number of scans written
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Folder with one file for each complete sequence: its settings and what the layout's tables need.
 MARKER_FOLDER = ".simulation"
+SHORTEST, LONGEST = 0.1, 50.0  # limits of the distance between two scans, metres
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Sequence:
         number: number of the sequence.
         scans: number of its scans.
         seed: seed of all sequences.
+        spacing: distance between two scans, metres.
     """
 
     out: Path
@@ -45,11 +48,19 @@ class Sequence:
     number: int
     scans: int
     seed: int
+    spacing: float = SPACING
+
+    @property
+    def drive(self) -> Drive:
+        """How the sensor moves. Streets are equally long, however dense their scans are."""
+        scans = round(Drive.scans_per_street * Drive.spacing / self.spacing)
+        return Drive(spacing=self.spacing, scans_per_street=max(scans, 1))
 
     @property
     def settings(self) -> dict[str, Any]:
         """The settings that, with the number of the sequence, determine the bytes of its files."""
-        return {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
+        settings = {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
+        return settings if self.spacing == SPACING else {**settings, "spacing": self.spacing}
 
     @property
     def marker(self) -> Path:
@@ -70,6 +81,7 @@ def simulate(
     scans: int = 10,
     seed: int = 0,
     first_sequence: int = 0,
+    spacing: float = SPACING,
     processes: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> Path:
@@ -87,6 +99,7 @@ def simulate(
         scans: number of scans in each sequence.
         seed: seed of all randomness.
         first_sequence: number of the first sequence.
+        spacing: distance between two scans, metres; a drive has scans every metre or so.
         processes: number of processes, each of which simulates one sequence at a time. A script
             that asks for more than one must guard its own code by `if __name__ == "__main__"`.
         progress: called with the number of scans written so far and the number of all scans.
@@ -102,12 +115,16 @@ def simulate(
     layout = LAYOUTS[sensor_of(sensor).layout]
     _check_at_least(1, sequences=sequences, scans=scans, processes=processes)
     _check_at_least(0, seed=seed, first_sequence=first_sequence)
+    if not SHORTEST <= spacing <= LONGEST:
+        raise SimulationError(
+            f"simulate: expected a spacing of {SHORTEST} to {LONGEST} m, found {spacing}"
+        )
     require_embree()
 
     out = Path(out)
     missing = []
     for number in range(first_sequence, first_sequence + sequences):
-        sequence = Sequence(out, sensor, number, scans, seed)
+        sequence = Sequence(out, sensor, number, scans, seed, spacing)
         if not _is_complete(sequence):
             _check_is_simulated(sequence)
             missing.append(sequence)
@@ -241,7 +258,7 @@ def _write(sequence: Sequence) -> Iterator[int]:
     layout = LAYOUTS[model.layout](sequence.out, sequence.number)
     seed = np.random.SeedSequence((sequence.seed, sequence.number))
     write_whole(sequence.begun, b"")
-    for index, scan in enumerate(drive_street(model, sequence.scans, seed)):
+    for index, scan in enumerate(drive_street(model, sequence.scans, seed, sequence.drive)):
         layout.write_scan(index, scan)
         yield 1
 

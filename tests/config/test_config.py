@@ -55,7 +55,7 @@ def test_every_builtin_recipe_is_there() -> None:
     full_size = {"semantickitti", "nuscenes", "simulated"}
     compact = {f"{name}-compact" for name in full_size} | {"simulated-hdl32e-compact"}
 
-    assert set(recipe_names()) == full_size | compact | {"finetune"}
+    assert set(recipe_names()) == full_size | compact | {"finetune", "adapt"}
 
 
 def test_the_semantickitti_recipe_holds_the_papers_numbers() -> None:

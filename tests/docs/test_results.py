@@ -35,9 +35,9 @@ def test_a_page_has_the_table_of_the_file(page: str) -> None:
 
 def test_what_evaluate_prints_in_the_pages_is_in_the_file() -> None:
     known = set()
-    printed_methods = [method for method in RESULTS.PRINTED_METHODS if method != "plain"]
     for row in RESULTS.read()["rows"]:
-        known.add(tuple(f"{row[method]:.1f}" for method in printed_methods))
+        alone = tuple(f"{row[method]:.1f}" for method in ("rv", "bev", "ensemble", "amvnet"))
+        known |= {alone, (*alone, f"{row.get('drive', 0):.1f}")}
 
     printed = set()
     for page in DOCS.glob("*.md"):

@@ -209,7 +209,7 @@ def by_evaluate_of_a_dataset(world: World, points: np.ndarray) -> np.ndarray:
 def _evaluated(world: World, dataset: Any) -> np.ndarray:
     labeller = label_by_weights(dataset, world.segmenter)
     (record,) = dataset.records(dataset.sequences("all"))
-    labels, _ = labeller.label(record, dataset.read(record))
+    labels, *_ = labeller.label(record, dataset.read(record))
     return labels["amvnet"]
 
 

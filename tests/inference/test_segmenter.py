@@ -317,7 +317,7 @@ def test_each_method_has_its_own_scores(result: Segmentation) -> None:
 
 
 def test_by_method_is_what_each_method_gives_alone(segmenter: Segmenter) -> None:
-    labels, uncertain = labels_by_method(segmenter, Scan(POINTS))
+    labels, uncertain, _ = labels_by_method(segmenter, Scan(POINTS))
     assert set(labels) == {"rv", "bev", "ensemble", "amvnet"}
     for method in METHOD_NAMES:
         if method in labels:
@@ -328,7 +328,7 @@ def test_by_method_is_what_each_method_gives_alone(segmenter: Segmenter) -> None
 
 def test_by_method_equals_each_method(segmenter: Segmenter) -> None:
     points, _ = with_lost_returns(POINTS)
-    labels, uncertain = labels_by_method(segmenter, Scan(points), METHOD_NAMES)
+    labels, uncertain, _ = labels_by_method(segmenter, Scan(points), METHOD_NAMES)
     assert tuple(METHODS) == METHOD_NAMES
     assert tuple(labels) == METHOD_NAMES
     for method in METHOD_NAMES:
@@ -345,7 +345,7 @@ def test_a_method_includes_those_that_need_no_more_than_its_networks() -> None:
     }
     for method, names in expected.items():
         segmenter = amvnet.load(WEIGHTS, method=method)  # type: ignore[arg-type]
-        labels, _ = labels_by_method(segmenter, Scan(POINTS), METHOD_NAMES)
+        labels, *_ = labels_by_method(segmenter, Scan(POINTS), METHOD_NAMES)
         assert list(labels) == names
         for name in names:
             assert np.array_equal(labels[name], labels_by(name))  # type: ignore[arg-type]
@@ -361,7 +361,7 @@ def test_prediction_runs_the_model_as_it_is(segmenter: Segmenter, result: Segmen
 @pytest.mark.parametrize(("method", "other"), [("rv", "polar_net"), ("bev", "range_net")])
 def test_by_method_of_one_network_is_that_network(method: MethodName, other: str) -> None:
     one_network = without(WEIGHTS, "point_head", other)
-    labels, uncertain = labels_by_method(amvnet.load(one_network, method=method), Scan(POINTS))
+    labels, uncertain, _ = labels_by_method(amvnet.load(one_network, method=method), Scan(POINTS))
     assert list(labels) == [method]
     assert uncertain is None
     assert np.array_equal(labels[method], labels_by(method))

@@ -259,3 +259,21 @@ def test_missing_embreex_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setitem(sys.modules, "embreex", None)
     with pytest.raises(SimulationError, match=r'pip install "amvnet\[simulate\]"'):
         simulate(tmp_path)
+
+
+@pytest.mark.full
+def test_a_dense_drive_has_scans_of_one_street_a_metre_apart(tmp_path: Path) -> None:
+    """It is another sequence than the one with the usual spacing, which does not replace it."""
+    pytest.importorskip("embreex")
+    simulate(tmp_path, scans=4, spacing=1.0)
+    poses = np.loadtxt(tmp_path / "sequences/00/poses.txt").reshape(-1, 3, 4)
+    steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1)
+    np.testing.assert_allclose(steps, 1, atol=0.3)
+    with pytest.raises(SimulationError, match="found"):
+        simulate(tmp_path, scans=4)
+
+
+@pytest.mark.parametrize("spacing", [0.0, 0.05, 51.0, float("nan")])
+def test_an_impossible_spacing_is_one_line(tmp_path: Path, spacing: float) -> None:
+    with pytest.raises(SimulationError, match=r"spacing of 0\.1 to 50\.0 m"):
+        simulate(tmp_path, scans=1, spacing=spacing)

@@ -38,7 +38,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def drive_quickly(
-    model: LidarModel, scans: int, seed: np.random.SeedSequence
+    model: LidarModel, scans: int, seed: np.random.SeedSequence, *how: object
 ) -> Iterator[SimulatedScan]:
     """Yield scans of `fake_drive` from a sensor that drives on."""
     (name,) = (name for name, other in LIDAR_MODELS.items() if other == model)

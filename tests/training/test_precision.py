@@ -90,7 +90,7 @@ def test_each_stage_of_each_recipe_trains_and_resumes_in_mixed_precision(
     else:
         words += [GOLDEN / "nuscenes", "--train-sequences", "scene-0103"]
         words += ["--val-sequences", "scene-0916"]
-    if recipe == "finetune":
+    if load_recipe(recipe).from_init:
         start = fresh_weights()
         view = replace(start.model.range_view, hidden=0.5)  # as the built-in weights have it
         start = replace(start, model=replace(start.model, range_view=view))

@@ -110,7 +110,7 @@ def test_the_page_has_the_labels_of_every_method(
     segmenter = amvnet.load(world / "w.safetensors")
     for index, record in enumerate(dataset.records(dataset.sequences("all"))):
         _, planes = page.scan(index)
-        labels, uncertain = labels_by_method(segmenter, dataset.read(record))
+        labels, uncertain, _ = labels_by_method(segmenter, dataset.read(record))
         assert list(labels) == ["rv", "bev", "ensemble", "amvnet"]
         for method, ids in labels.items():
             np.testing.assert_array_equal(planes[method], ids)

@@ -10,6 +10,7 @@ from typing import Any
 
 from amvnet import __version__
 from amvnet.cli.commands.ablate import ablate
+from amvnet.cli.commands.adapt import adapt
 from amvnet.cli.commands.analyze import analyze
 from amvnet.cli.commands.bench import bench
 from amvnet.cli.commands.check import check
@@ -20,6 +21,7 @@ from amvnet.cli.commands.fleet import fleet
 from amvnet.cli.commands.fuse import fuse
 from amvnet.cli.commands.info import info
 from amvnet.cli.commands.list import list as list_names
+from amvnet.cli.commands.map import map as map_drive
 from amvnet.cli.commands.predict import predict
 from amvnet.cli.commands.rank import rank
 from amvnet.cli.commands.simulate import simulate
@@ -33,10 +35,10 @@ from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
 # The functions of the commands, in the order of the help.
-_FIRST = (demo, simulate, check, train, predict, fleet, evaluate, submit, fuse)
+_FIRST = (demo, simulate, check, train, adapt, predict, fleet, evaluate, map_drive, submit, fuse)
 _LAST = (rank, analyze, ablate, export, view, bench, list_names, info)
 COMMANDS = {function.__name__: function for function in _FIRST + _LAST}
-WITH_RESUME = ("train", "predict", "fleet")  # commands that have --resume
+WITH_RESUME = ("train", "adapt", "predict", "fleet")  # commands that have --resume
 CONTINUED_WHEN_REPEATED = (
     "simulate",
     "ablate",

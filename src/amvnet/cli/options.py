@@ -17,6 +17,7 @@ from amvnet.progress import counted
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.data.datasets.select import TrainingScans
+    from amvnet.inference.drive import DriveChoice
     from amvnet.inference.listing import ScanOptions
     from amvnet.inference.request import LabellingRequest
     from amvnet.inference.scores import ScorePair
@@ -241,6 +242,35 @@ class LabelChoice:
             scores=self.scores,
             uncertain=self.uncertain,
         )
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """Whether the scores of drives are fused over time."""
+
+    drive: bool = False
+    """the scans of each sequence, folder or bag are a drive: fuse what they say of the same
+    places."""
+    poses: Path | None = None
+    """with --drive, the poses of the LiDAR: KITTI's lines of 12 numbers, TUM's lines of time x y z
+    qx qy qz qw, or .npy (N, 4, 4); default: the dataset's, or estimated by KISS-ICP."""
+    past_only: bool = False
+    """with --drive, fuse each scan only with scans before it, as on a robot."""
+
+    def parse(self) -> DriveChoice | None:
+        """Return how drives are fused, or None if each scan is labelled alone.
+
+        Raises:
+            InputError: if an option needs --drive.
+        """
+        from amvnet.inference.drive import DriveChoice
+
+        if self.drive:
+            return DriveChoice(self.poses, self.past_only)
+        for flag, is_given in (("--poses", self.poses), ("--past-only", self.past_only)):
+            if is_given:
+                raise InputError(f"{flag}: expected --drive, found none; add it")
+        return None
 
 
 @dataclass(frozen=True)

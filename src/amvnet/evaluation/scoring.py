@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,10 +16,12 @@ from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy, check_classes
+from amvnet.drives.consensus import DriveScan
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import PICTURE, TopView, draw_scan
 from amvnet.files import inside
+from amvnet.inference.drive import Drives
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
@@ -32,11 +35,26 @@ from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan, check_scan
 
 Result = TypeVar("Result")
-# The train ids (N,) by method; and (N,) bool, the uncertain points, or None if there are not two
-# networks.
-MethodLabels = tuple[dict[str, np.ndarray], np.ndarray | None]
+DRIVE = "drive"  # the method whose labels are the consensus of a drive
 
 MAX_PICTURES = 4  # largest number of scans that are drawn; they are evenly spaced
+
+
+class MethodLabels(NamedTuple):
+    """The labels of the N points of a scan.
+
+    Attributes:
+        ids: the train ids (N,) by method.
+        uncertain: (N,) bool, the uncertain points, or None if there are not two networks.
+        scores: (N, K) the scores of the segmenter's method, or None if there is no segmenter.
+    """
+
+    ids: dict[str, np.ndarray]
+    uncertain: np.ndarray | None = None
+    scores: np.ndarray | None = None
+
+
+Labelled = tuple[ScanRecord, Scan, MethodLabels]  # a scan with its labels by several methods
 
 
 @dataclass(frozen=True)
@@ -70,6 +88,7 @@ def evaluate(
     pictures: Path | None = None,
     progress: Progress = no_progress,
     processes: Processes = ALONE,
+    drives: Drives | None = None,
 ) -> Evaluation:
     """Score the labels of some scans.
 
@@ -80,6 +99,7 @@ def evaluate(
         pictures: folder for pictures of a few scans from above. By default, none are drawn.
         progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans. Each returns the evaluation of all scans.
+        drives: the poses of the scans, if the method `DRIVE` is to be scored as well.
 
     Raises:
         InputError: if the labels do not have the dataset's classes, or a scan has no true labels.
@@ -96,13 +116,17 @@ def evaluate(
         return record, scan, labeller.label(record, scan)
 
     share = processes.share(records)
-    labelled = stream_labelled(dataset, share, label, labeller.at_once, progress)
+    labelled: Iterator[Labelled] = stream_labelled(
+        dataset, share, label, labeller.at_once, progress
+    )
+    if drives is not None:
+        labelled = _with_consensus(labelled, drives)
     for record, scan, labels in labelled:
         assert scan.labels is not None
         truth = true_table[scan.labels]
-        labels_by_name, uncertain = labels
-        ids = {name: table[values] for name, values in labels_by_name.items()}
+        ids = {name: table[values] for name, values in labels.ids.items()}
 
+        uncertain = labels.uncertain
         evaluation.add(scan.points, truth, ids, uncertain=uncertain)
         if pictures is not None and record.name in pictured:
             view = TopView(
@@ -111,6 +135,23 @@ def evaluate(
             draw_scan(_picture_of(record, pictures), view)
 
     return sum(processes.gather(evaluation), Evaluation(taxonomy))
+
+
+def _with_consensus(labelled: Iterator[Labelled], drives: Drives) -> Iterator[Labelled]:
+    """Add the labels by `DRIVE` to the labels of scans, which are in the order of their drives."""
+    for _, drive in groupby(labelled, key=lambda item: item[0].sequence):
+        for (record, scan, labels), scores, _ in drives.consensus().stream(
+            _drive_scan(item, drives) for item in drive
+        ):
+            ids = np.where(scores.any(axis=1), scores.argmax(axis=1) + 1, 0)
+            yield record, scan, labels._replace(ids={**labels.ids, DRIVE: ids})
+
+
+def _drive_scan(item: Labelled, drives: Drives) -> DriveScan[Labelled]:
+    record, scan, labels = item
+    assert labels.scores is not None
+    pose = drives.poses[record.sequence, record.name]
+    return DriveScan(item, scan.points[:, :3], labels.scores, pose)
 
 
 def pictures_of(records: Sequence[ScanRecord], folder: Path) -> dict[Path, Signature]:
@@ -173,9 +214,6 @@ def labels_by_method(
     AMVNet and the ensembles include all ensembles and each single network. Other `methods` are left
     out. The networks run only once.
 
-    Returns:
-        (N,) train ids by method; and (N,) bool, the uncertain points, or None if there are not two
-        networks.
     """
     batch = segmenter.batch([scan])
     scores = segmenter.engine.score(batch)
@@ -188,9 +226,10 @@ def labels_by_method(
         if values is not None:
             labels[name] = expand_labels(values, scan.valid)
 
-    if not METHODS[segmenter.method].has_two_networks:
-        return labels, None
-    return labels, expand_to_scan(scores.uncertain, scan.valid)
+    uncertain = None
+    if METHODS[segmenter.method].has_two_networks:
+        uncertain = expand_to_scan(scores.uncertain, scan.valid)
+    return MethodLabels(labels, uncertain, expand_to_scan(scores.merged, scan.valid))
 
 
 @torch.inference_mode()
@@ -221,6 +260,6 @@ def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = 
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
-        return {"predictions": dataset.read_prediction(record, folder)}, None
+        return MethodLabels({"predictions": dataset.read_prediction(record, folder)})
 
     return Labeller(label, dataset.taxonomy, classes)

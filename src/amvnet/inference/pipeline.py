@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -35,6 +35,9 @@ from amvnet.outputs import Signature, check_not_read, check_outputs
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED_SCANS
+
+if TYPE_CHECKING:
+    from amvnet.inference.drive import Drives
 
 UNCERTAIN_ENDING = ".uncertain.npy"
 DIGEST_LENGTH = 16  # the hexadecimal digits of a digest in the journal
@@ -104,6 +107,7 @@ class Pipeline:
             rounding.
         at_once: the number of batches that are segmented at the same time, each with its share of
             the threads.
+        drives: the poses of the scans, if their scores are to be fused over time.
         is_checked: whether the caller has called `check_output`. A run that resumes checks by
             itself, because it may replace the files of the earlier run.
     """
@@ -115,6 +119,7 @@ class Pipeline:
     batch: int = 1
     at_once: int = 1
     is_checked: bool = False
+    drives: Drives | None = None
 
     def run(
         self, settings: Mapping[str, Any], progress: Progress = no_progress
@@ -143,10 +148,23 @@ class Pipeline:
         remaining = [scan for scan in self.scans if _key(scan) not in done]
         kept = done if self.output.resume else self._entries_of_others(settings)
 
-        faults = []
+        # Scans around the remaining ones are segmented again, if labels depend on them.
+        segmented = remaining
+        if self.drives is not None:
+            segmented = self.drives.in_reach(self.scans, remaining)
+        new = {_key(scan) for scan in remaining}
+
+        def write(outcome: Outcome) -> Entry | str | None:
+            return self.write_or_explain(outcome) if _key(outcome[0]) in new else None
+
+        faults: list[str] = []
         with Journal(folder, settings, kept.values()) as journal:
-            for count, outcome in enumerate(self.stream(remaining, self.write_or_explain)):
+            count = 0
+            for outcome in self.stream(segmented, write):
+                if outcome is None:
+                    continue
                 progress(count, len(remaining))
+                count += 1
                 if isinstance(outcome, Entry):
                     journal.add(outcome)
                 else:
@@ -227,7 +245,10 @@ class Pipeline:
         writing = deque[Future[Written]]()
         # Reading, computing and writing go on at the same time, each on other scans.
         with closing(groups), ThreadPoolExecutor(writers) as pool:
-            for outcome in chain.from_iterable(groups):
+            outcomes: Iterator[Outcome] = chain.from_iterable(groups)
+            if self.drives is not None:
+                outcomes = self.drives.fuse(outcomes)
+            for outcome in outcomes:
                 writing.append(pool.submit(write, outcome))
                 # Yield what is written without delay, so that it gets into the journal.
                 while writing and (len(writing) > READ_AHEAD or writing[0].done()):

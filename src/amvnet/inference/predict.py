@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
+from amvnet.inference.drive import DriveChoice, find_poses
 from amvnet.inference.journal import Entry, describe_other_run
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import Pipeline, Segment, check_faults, check_output
@@ -35,6 +36,7 @@ def predict(
     *,
     sequences: Sequence[str] | None = None,
     split: str = "all",
+    drive: DriveChoice | None = None,
     batch: int = 1,
     overwrite: bool = False,
     resume: bool = False,
@@ -52,6 +54,8 @@ def predict(
             may take long.
         folder: the folder for the files.
         sequences, split: which scans of datasets to use, as `ScanOptions` takes them.
+        drive: how the scores of drives are fused over time; by default, each scan is segmented
+            alone.
         batch: the number of scans that go through the networks together.
         overwrite: replace files that exist.
         resume: leave out the scans that an earlier run with an equal request has done.
@@ -83,6 +87,12 @@ def predict(
     output = replace(output, also_read=also_read)
     if not resume:  # the files of the earlier run are known only with the precision
         check_output(scans, output)
+    drives = None
+    if drive is not None:
+        drives = find_poses(scans, drive.poses, drive.past_only, report=report)
+        table = None if classes is None else classes.table(request.weights.taxonomy)
+        drives = replace(drives, table=table)
+        request = replace(request, drive=drives.digest)
     segmenter = make_segmenter()
     request = replace(request, precision=segmenter.engine.precision)  # not "auto"
     pipeline = Pipeline(
@@ -93,6 +103,7 @@ def predict(
         batch=batch,
         at_once=segmenter.at_once,
         is_checked=not resume,
+        drives=drives,
     )
     if not resume:
         names = {str(scan.scores_path) for scan in scans}

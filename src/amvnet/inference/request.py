@@ -43,6 +43,7 @@ class LabellingRequest(Checked):
         kind: the format of the labels of scan files, one of `writers.KINDS`.
         scores: whether to write the probabilities of both networks.
         uncertain: whether to write which points are uncertain.
+        drive: the digest of the poses by which scores are fused over time; None if they are not.
 
     Raises:
         InputError: if the weights lack a part that the method needs, the method has no uncertain
@@ -62,6 +63,7 @@ class LabellingRequest(Checked):
     kind: str = "label"
     scores: bool = False
     uncertain: bool = False
+    drive: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -106,6 +108,7 @@ class LabellingRequest(Checked):
             "scores": self.scores,
             "uncertain": self.uncertain,
             "format": self.kind,
+            "drive": self.drive,
         }
 
     def output(self, folder: Path, overwrite: bool = False, resume: bool = False) -> OutputOptions:

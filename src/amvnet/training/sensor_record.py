@@ -41,6 +41,11 @@ def sensor_record(
         records: the training scans.
         intensity: the intensities that the network learns, or None if these are unknown.
     """
+    first = dataset.members[0]
+    if first.sensor_record is not None:
+        keys = (SENSOR_KEY, QUANTILES_KEY, MATCHED_KEY, OPTIONAL_KEY)
+        return {key: first.sensor_record[key] for key in keys if key in first.sensor_record}
+
     scans = []
     for sampled in evenly_spaced(records, SAMPLED_SCANS):
         with suppress(InputError):
@@ -56,7 +61,6 @@ def sensor_record(
     record: dict[str, Any] = {QUANTILES_KEY: mean if is_known else []}
 
     # The weights will get scans that are normalised in the same way, so record the normalisation.
-    first = dataset.members[0]
     normalised = normalised_record(first) if isinstance(first, OwnScans) else {}
     record |= normalised or {SENSOR_KEY: {**measure_sensor(scans), AS_IS_KEY: True}}
     if intensity is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report, show
-from amvnet.cli.options import LabelledChoice, join_processes, load_segmenter
+from amvnet.cli.options import DriveOptions, LabelledChoice, join_processes, load_segmenter
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
 from amvnet.models.methods import (
@@ -22,8 +22,9 @@ from amvnet.models.methods import (
 )
 
 if TYPE_CHECKING:
-    from amvnet.data.datasets.base import ScanRecord
+    from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.evaluation.metrics import Evaluation
+    from amvnet.inference.drive import Drives
 
 
 def evaluate(
@@ -31,6 +32,7 @@ def evaluate(
     /,
     choice: LabelledChoice,
     compute: Compute,
+    time: DriveOptions,
     weights: str | None = None,
     predictions: Path | None = None,
     methods: tuple[MethodName, ...] = PAPER_METHODS,
@@ -46,6 +48,7 @@ def evaluate(
         data: the dataset.
         choice: which scans to score.
         compute: where and how the networks are computed.
+        time: with --weights, whether to score the fusion over time as well, as the method drive.
         weights: a weights file, or the name of built-in weights.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
         methods: with --weights, the methods to score, separated by commas; rv-knn is rv with a vote
@@ -78,6 +81,7 @@ def evaluate(
         check_outputs(outputs, [data, weights, classes], overwrite)
 
     processes = join_processes()
+    drives = None
     mapping = None if classes is None else class_map(classes)
     if weights is not None and predictions is None:
         loaded = load(weights)
@@ -85,6 +89,7 @@ def evaluate(
         dataset = normalised(opened, normaliser_for(loaded))
         records = choice.records(dataset)
         check_files(records)
+        drives = _find_drives(time, dataset, records, processes.size)
         _check_methods(methods, weights, loaded.parts, processes.first)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]
@@ -93,8 +98,11 @@ def evaluate(
         segmenter = load_segmenter(loaded, widest_method(parts), compute, tau)
         labeller = label_by_weights(dataset, segmenter, methods, mapping)
     elif predictions is not None and weights is None:
-        if tau is not None:
-            raise InputError("--tau: expected --weights, found --predictions; leave --tau out")
+        for flag, is_given in (("--tau", tau is not None), ("--drive", time.drive)):
+            if is_given:
+                raise InputError(
+                    f"{flag}: expected --weights, found --predictions; leave {flag} out"
+                )
         dataset = open_dataset(data)
         records = choice.records(dataset)
         check_files(records)
@@ -117,9 +125,30 @@ def evaluate(
             pictures,
             progress=step,
             processes=processes,
+            drives=drives,
         )
     if processes.first:
         show_evaluation(evaluation, data, json, tau)
+
+
+def _find_drives(
+    time: DriveOptions, dataset: Dataset, records: Sequence[ScanRecord], processes: int
+) -> Drives | None:
+    """Return the poses of the scans, if their scores are to be fused over time.
+
+    Raises:
+        InputError: if several processes would share the scans, or there are no poses that fit.
+    """
+    from amvnet.inference.drive import find_poses
+    from amvnet.inference.listing import DatasetScan
+
+    chosen = time.parse()
+    if chosen is None:
+        return None
+    if processes > 1:
+        raise InputError("--drive: expected one process, found several; start it without torchrun")
+    scans = [DatasetScan(dataset, record) for record in records]
+    return find_poses(scans, chosen.poses, chosen.past_only, report=report)
 
 
 def _check_methods(

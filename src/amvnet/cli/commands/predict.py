@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_segmenter
+from amvnet.cli.options import DriveOptions, LabelChoice, ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Count
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute
@@ -25,6 +25,7 @@ def predict(
     sensor_choice: SensorChoice,
     compute: Compute,
     labels: LabelChoice,
+    time: DriveOptions,
     batch: Count = 1,
     resume: bool = False,
     overwrite: bool = False,
@@ -39,6 +40,7 @@ def predict(
         sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
         labels: how points are labelled, and which files are written.
+        time: whether the scores of drives are fused over time.
         batch: number of scans that go through the networks together; more than one suits a GPU.
         resume: continue an earlier run in the folder, with the same weights and options; segment
             only scans that are new or were not finished.
@@ -63,6 +65,7 @@ def predict(
             Path(out),
             sequences=choice.sequences,
             split=choice.split,
+            drive=time.parse(),
             batch=batch,
             overwrite=overwrite,
             resume=resume,

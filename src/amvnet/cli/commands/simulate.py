@@ -20,6 +20,7 @@ def simulate(
     sequences: Count = 1,
     scans: Count = 10,
     seed: Seed = 0,
+    spacing: Annotated[float, Range(0.1, 50)] = 8.0,
     processes: Annotated[int, Range(1, 1024)] | None = None,
 ) -> None:
     """Write labelled scans of simulated streets; scans of an earlier call stay.
@@ -33,6 +34,8 @@ def simulate(
         scans: number of scans in each sequence.
         seed: the seed of all random numbers; the same seed gives the same bytes on the same kind of
             processor.
+        spacing: distance between two scans, metres; 1 makes a drive, whose scans predict --drive
+            fuses.
         processes: number of sequences that are simulated at the same time; default: one per
             processor.
     """
@@ -47,6 +50,7 @@ def simulate(
             sequences=sequences,
             scans=scans,
             seed=seed,
+            spacing=spacing,
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=step,
         )

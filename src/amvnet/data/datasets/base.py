@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from amvnet.data.labels.ids import check_count, read_ids, train_ids, write_ids
+from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
@@ -51,6 +53,9 @@ class Dataset(ABC):
     """
 
     readers = 8  # threads that may read scans at the same time
+    # The training record of the weights to which the scans are normalised, or None if the sensor is
+    # to be measured.
+    sensor_record: Mapping[str, Any] | None = None
 
     def __init__(self, root: Path | str, taxonomy: Taxonomy, spec: str | None = None) -> None:
         self.root = Path(root)
@@ -156,6 +161,14 @@ class Dataset(ABC):
     def having_labels(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
         """Return the scans that have labels, which may be none."""
         return [record for record in records if record.has_labels]
+
+    def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
+        """Return the poses (N, 4, 4) of the LiDAR in scans of one sequence, or None if unknown.
+
+        Raises:
+            InputError: if the files of the poses are broken, or lack a scan.
+        """
+        return None
 
     def files_of(self, record: ScanRecord) -> list[Path]:
         """Return the files of a scan: its points and labels, which no output may replace."""

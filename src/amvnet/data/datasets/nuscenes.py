@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split, not_trained_on
 from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
+from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError, shown
 from amvnet.files import checked_token
@@ -186,6 +188,32 @@ class NuScenes(Dataset):
                 "found none; unpack nuScenes-lidarseg into the same folder"
             )
         return list(records)
+
+    def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
+        """Return the poses of the LiDAR, from the tables of the car's poses and of its sensors."""
+        ego = self._motions("ego_pose")
+        sensor = self._motions("calibrated_sensor")
+        rows = {row["token"]: row for row in filter(_is_scan, self._table("sample_data"))}
+        poses = []
+        for record in records:
+            row = rows[record.name]
+            poses.append(ego[row["ego_pose_token"]] @ sensor[row["calibrated_sensor_token"]])
+        return np.array(poses)
+
+    def _motions(self, table: str) -> dict[str, Poses]:
+        """Return the (4, 4) motions of a table by their tokens."""
+        rows = self._table(table)
+        try:
+            motions = np.tile(np.eye(4), (len(rows), 1, 1))
+            motions[:, :3, 3] = [row["translation"] for row in rows]
+            quaternions = [row["rotation"] for row in rows]  # w x y z
+            motions[:, :3, :3] = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+            return dict(zip([row["token"] for row in rows], motions, strict=True))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{self.root / self.version / table}.json: expected translations and rotations, "
+                f"found another table ({error}); unpack it again"
+            ) from None
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""

@@ -11,6 +11,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord, check_split, not_trai
 from amvnet.data.formats.cloud import check_usable
 from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import check_bits, read_ids, train_ids
+from amvnet.data.poses import Poses, read_poses
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -86,6 +87,21 @@ class SemanticKitti(Dataset):
         """Read the (N,) raw ids of one scan."""
         assert record.labels_path is not None
         return check_bits(record.labels_path, read_ids(record.labels_path, np.uint32, count))
+
+    def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
+        """Return the poses of the LiDAR, from poses.txt and calib.txt of the sequence."""
+        path = self._folder / records[0].sequence / "poses.txt"
+        if not path.is_file():
+            return None
+        # The line of a pose is the number of its scan.
+        poses = read_poses(path).poses
+        numbers = [int(record.points_path.stem) for record in records]
+        if max(numbers) >= len(poses):
+            raise InputError(
+                f"{path}: expected a pose for each scan, found {len(poses)} poses and the scan "
+                f"{max(numbers):06d}; give the poses of this sequence"
+            )
+        return poses[numbers]
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""

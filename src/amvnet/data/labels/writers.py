@@ -34,7 +34,7 @@ SIGNATURES = {
 }
 UNCERTAIN = Signature("an array of uncertain points", _ARRAY % rb"\|b1")
 SCORES = Signature("scores of predict", rb"PK\x03\x04.{26}(rv|bev)\.npy")
-PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
+PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u2": "ushort", "u1": "uchar"}
 
 
 def check_kind(kind: str) -> None:
@@ -93,7 +93,7 @@ def write_scan_labels(
         columns["class"] = raw.astype(np.int32)
         if uncertain is not None:
             columns["uncertain"] = np.asarray(uncertain).astype(np.uint8)
-        _write_ply(part, columns)
+        write_ply(part, columns)
     return path
 
 
@@ -114,7 +114,7 @@ def _coordinates(xyz: np.ndarray) -> dict[str, np.ndarray]:
     return {"x": x, "y": y, "z": z}
 
 
-def _write_ply(path: Path, columns: dict[str, np.ndarray]) -> None:
+def write_ply(path: Path, columns: dict[str, np.ndarray]) -> None:
     """Write (N,) columns as the properties of vertices."""
     fields = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
     table = np.rec.fromarrays(list(columns.values()), dtype=fields)

@@ -1,0 +1,96 @@
+"""The command `adapt`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from amvnet.cli.console import on_terminal, progress, report
+from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
+from amvnet.config.bounds import Count, Share
+from amvnet.models.methods import Compute
+
+if TYPE_CHECKING:
+    from amvnet.data.datasets.base import Dataset
+    from amvnet.inference.segmenter import Segmenter
+    from amvnet.training.plan import Plan
+    from amvnet.weights.file import Weights
+
+
+def adapt(
+    inputs: list[str],
+    /,
+    weights: str,
+    out: Path,
+    choice: ScanChoice,
+    sensor_choice: SensorChoice,
+    compute: Compute,
+    poses: Path | None = None,
+    loose: bool = False,
+    epochs: Count | None = None,
+    streets: Share = 0.5,
+    seed: Count | None = None,
+    resume: bool = False,
+) -> None:
+    """Teach weights by an unlabelled drive: by the consensus of their own labels over time.
+
+    Args:
+        inputs: the scans of one or several drives: datasets, bags, folders or patterns.
+        weights: the weights that label the drive, and that the training begins with: a weights
+            file with both networks, or the name of built-in weights.
+        out: folder of the run; it then holds the adapted weights.
+        choice: which scans of the inputs to use.
+        sensor_choice: what is known about the sensor of scan files.
+        compute: where and how the networks are computed.
+        poses: the poses of the LiDAR, as predict takes them; default: the dataset's, or estimated
+            by KISS-ICP.
+        loose: the scans are no drive; each teaches by its own labels.
+        epochs: number of epochs; default: 5.
+        streets: share of simulated streets in an epoch, which keep the networks from forgetting
+            classes that the drive lacks; 0 for none.
+        seed: the seed of the training; default: 0.
+        resume: continue an earlier run in the folder.
+    """
+    from amvnet.data.datasets.joined import join
+    from amvnet.data.datasets.select import TrainingScans, all_to_train
+    from amvnet.data.datasets.simulated import SimulatedStreets
+    from amvnet.inference.drive import find_poses
+    from amvnet.inference.listing import list_inputs
+    from amvnet.inference.reading import normaliser_for
+    from amvnet.training.adapt import adapt as adapt_weights
+    from amvnet.training.adapt import recipe_for
+    from amvnet.training.plan import Plan
+    from amvnet.weights.file import load
+
+    loaded = load(weights)
+    normaliser = normaliser_for(loaded, sensor_choice.parse(), report)
+    scans, _ = list_inputs(inputs, choice.parse(), loaded.taxonomy, normaliser)
+    recipe = recipe_for(loaded, epochs, streets, seed)
+    drives = None
+    if not loose:
+        with progress("poses") as step:
+            drives = find_poses(scans, poses, progress=step, report=report)
+
+    def make_segmenter(chosen: Weights) -> Segmenter:
+        return load_segmenter(chosen, "amvnet", compute)
+
+    def make_plan(dataset: Dataset) -> Plan:
+        mixed = []
+        if streets:
+            mixed = [all_to_train(SimulatedStreets(out / "streets", loaded.sensor))]
+        taught = TrainingScans(dataset, dataset.records(dataset.official("all")), [])
+        joined = join(taught, mixed, recipe.training.others)
+        return Plan(
+            recipe,
+            joined,
+            out,
+            resume=resume,
+            report=report,
+            bars=on_terminal(),
+            also_read=(*inputs, weights, poses),
+        )
+
+    path = adapt_weights(
+        scans, drives, loaded, make_segmenter, make_plan, progress=progress, report=report
+    )
+    report(f"weights in {path}")

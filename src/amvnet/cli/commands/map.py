@@ -1,0 +1,82 @@
+"""The command `map`."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import Annotated
+
+from amvnet.cli.console import progress, report
+from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
+from amvnet.config.bounds import Range
+from amvnet.models.methods import Compute
+from amvnet.progress import counted
+
+SHOWN_CLASSES = 4  # number of classes in the line about the map
+
+
+def map(
+    inputs: str,
+    /,
+    weights: str,
+    out: Path,
+    choice: ScanChoice,
+    sensor_choice: SensorChoice,
+    compute: Compute,
+    poses: Path | None = None,
+    voxel: Annotated[float, Range(0.02, 10)] = 0.2,
+    keep_movable: bool = False,
+    json: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Make one labelled cloud of the static world that a drive has seen.
+
+    Args:
+        inputs: the scans of a drive: a dataset with --sequences, a bag, a folder or a pattern.
+        weights: a weights file, or the name of built-in weights.
+        out: the map, FILE.ply, FILE.las or FILE.laz: a point for each voxel, with its class, its
+            confidence and the number of scans that saw it.
+        choice: which scans of the input to use.
+        sensor_choice: what is known about the sensor of scan files.
+        compute: where and how the networks are computed.
+        poses: the poses of the LiDAR, as predict takes them; default: the dataset's, or estimated
+            by KISS-ICP.
+        voxel: edge of the voxels, metres.
+        keep_movable: keep voxels of vehicles, two-wheelers and people, which may have moved.
+        json: file for the figures of the map: scans, metres, voxels by class.
+        overwrite: replace files that exist.
+    """
+    from amvnet.drives.world_map import FIGURES, SIGNATURES, check_ending
+    from amvnet.files import atomic_write, make_folder
+    from amvnet.inference.drive import find_poses
+    from amvnet.inference.listing import list_inputs
+    from amvnet.inference.map import describe_map, map_drive
+    from amvnet.inference.reading import normaliser_for
+    from amvnet.outputs import check_outputs
+    from amvnet.weights.file import load
+
+    check_ending(out)
+    outputs = {out: SIGNATURES[out.suffix]}
+    if json is not None:
+        outputs[json] = FIGURES
+    check_outputs(outputs, [inputs, weights, poses], overwrite)
+    loaded = load(weights)
+    normaliser = normaliser_for(loaded, sensor_choice.parse(), report)
+    scans, _ = list_inputs([inputs], choice.parse(), loaded.taxonomy, normaliser)
+    with progress("poses") as step:
+        drives = find_poses(scans, poses, progress=step, report=report, is_one=True)
+    make_folder(out.parent)
+
+    segmenter = load_segmenter(loaded, "amvnet", compute)
+    with progress("mapping") as step:
+        world = map_drive(scans, drives, segmenter, voxel, keep_movable, step)
+    world.write(out)
+    figures = describe_map(world, len(scans))
+    if json is not None:
+        with atomic_write(json) as part:
+            part.write_text(json_format.dumps(figures, indent=1))
+    largest = sorted(figures["classes"].items(), key=lambda item: -item[1])[:SHOWN_CLASSES]
+    shares = ", ".join(f"{count / max(len(world), 1):.0%} {name}" for name, count in largest)
+    report(
+        f"{out}: {len(world):,} voxels of {voxel:g} m from {counted(len(scans), 'scan')}: {shares}"
+    )

@@ -1,0 +1,111 @@
+"""Estimate the poses of a drive from its scans, and check that poses fit them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from amvnet.data.poses import Poses
+from amvnet.errors import InputError
+
+GAP = 5  # number of scans between the two scans of a pair that shows whether poses fit
+PAIRS = 8  # number of pairs that are compared, evenly spaced over the drive
+CHECKED_POINTS = 2000  # number of points of a scan that are compared
+NEAREST, FARTHEST = 2.0, 30.0  # distances of the points that are compared, metres
+CLOSE = 0.15  # median distance up to which poses fit, metres
+# With true poses, the median distance is 0.06 to 0.29 of the distance without any motion, and with
+# wrong poses 0.5 to 47 times that distance (docs/log.md).
+LARGEST_RATIO = 0.5
+VOXEL = 1.0  # edge of the voxels of KISS-ICP's map, metres
+
+
+class Odometry:
+    """Estimates the pose of each scan from the scans before it, by KISS-ICP (Vizzo et al., 2023).
+
+    The first scan is at the origin. One thread computes, so that equal scans have equal poses.
+
+    Raises:
+        InputError: if the package kiss-icp is missing.
+    """
+
+    def __init__(self) -> None:
+        try:
+            from kiss_icp.config import KISSConfig
+            from kiss_icp.config.config import DataConfig, MappingConfig, RegistrationConfig
+            from kiss_icp.kiss_icp import KissICP
+        except ImportError:
+            raise InputError(
+                "expected poses, or the package kiss-icp, which estimates them, found neither; run "
+                'pip install "amvnet[drives]", or give poses'
+            ) from None
+
+        # The points have no times, by which their motion within a scan could be undone.
+        config = KISSConfig(
+            data=DataConfig(deskew=False),
+            mapping=MappingConfig(voxel_size=VOXEL),
+            registration=RegistrationConfig(max_num_threads=1),
+        )
+        self._odometry = KissICP(config)
+
+    def __call__(self, xyz: NDArray[np.floating]) -> Poses:
+        """Return the pose (4, 4) of the next scan, given its valid points (M, 3) in metres."""
+        self._odometry.register_frame(np.asarray(xyz, np.float64), np.empty(0))
+        pose: Poses = self._odometry.last_pose.copy()
+        return pose
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two scans of a drive, some scans apart.
+
+    Attributes:
+        before, after: (M, 3) their points that stand above the ground, metres.
+        motion: (4, 4) moves points of the second scan into the first one.
+    """
+
+    before: NDArray[np.floating]
+    after: NDArray[np.floating]
+    motion: Poses
+
+
+def check_fit(pairs: Iterable[Pair], name: str) -> None:
+    """Check that poses fit the scans: that the surfaces of two scans meet in the world.
+
+    With wrong poses, each wall is seen twice: the median distance from a point to the next point of
+    the other scan is about as large as if the sensor had not moved.
+
+    Args:
+        name: the name of the poses in the message.
+
+    Raises:
+        InputError: if the poses do not fit.
+    """
+    distances = []
+    for pair in pairs:
+        before = _compared(pair.before)
+        after = _compared(pair.after)
+        after = after[:: max(len(after) // CHECKED_POINTS, 1)]
+        if len(before) and len(after):
+            tree = KDTree(before)
+            moved = after @ pair.motion[:3, :3].T + pair.motion[:3, 3]
+            medians = [np.median(tree.query(points)[0]) for points in (moved, after)]
+            distances.append(medians)
+    if not distances:
+        return
+
+    moved_by, without = np.median(distances, axis=0)
+    if moved_by > max(CLOSE, LARGEST_RATIO * without):
+        raise InputError(
+            f"{name}: expected poses under which the scans meet, found their points "
+            f"{moved_by:.2f} m apart, and {without:.2f} m without any motion; give the poses of "
+            "this drive's LiDAR in metres, or let them be estimated"
+        )
+
+
+def _compared(xyz: NDArray[np.floating]) -> NDArray[np.float64]:
+    distance = np.linalg.norm(xyz, axis=1)
+    return np.asarray(xyz[(distance > NEAREST) & (distance < FARTHEST)], np.float64)

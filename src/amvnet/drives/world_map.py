@@ -1,0 +1,180 @@
+"""Collect the static world of a drive in one labelled cloud, with one point for each voxel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from amvnet.data.class_maps import class_map
+from amvnet.data.labels.writers import write_ply
+from amvnet.data.poses import Poses
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.drives.consensus import STEPS, VoxelTable, index_of, keys_of, sum_by, weighted_logs
+from amvnet.errors import InputError
+from amvnet.files import atomic_write
+from amvnet.outputs import Signature
+
+MOVABLE = ("vehicle", "two-wheeler", "person")  # coarse classes whose points may move
+FULL_COLOR = 257  # colours of LAS have 16 bits: 255 * 257 = 65535
+MILLIMETRE = 0.001
+LAS_FORMAT = 7  # the point format of LAS 1.4 with colours and classes up to 255
+
+_PLY = (
+    rb"ply\nformat binary_little_endian 1\.0\nelement vertex \d+\n"
+    rb"property double x\nproperty double y\nproperty double z\n.*property ushort sights\n"
+)
+# The files of a map, by their ending.
+SIGNATURES = {
+    ".ply": Signature("a map", _PLY),
+    ".las": Signature("a map in LAS", b"LASF"),
+    ".laz": Signature("a map in LAZ", b"LASF"),
+}
+FIGURES = Signature("figures of map", rb'\{\s*"scans": ')
+
+
+@dataclass(frozen=True)
+class WorldMap:
+    """The voxels of a map.
+
+    Attributes:
+        xyz: (V, 3) float64 mean of the points in each voxel, in the world, metres.
+        labels: (V,) uint8 train ids.
+        confidence: (V,) float32 probability of the label, in [0, 1].
+        sights: (V,) uint16 number of scans that see the voxel.
+        taxonomy: the classes of the labels.
+    """
+
+    xyz: NDArray[np.float64]
+    labels: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    sights: NDArray[np.uint16]
+    taxonomy: Taxonomy
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def write(self, path: Path) -> None:
+        """Write the map as `.ply`, `.las` or `.laz`; the file appears whole or not at all.
+
+        A PLY has x, y, z (double), red, green, blue (uchar), class (raw id, int), confidence
+        (float) and sights (ushort). LAS and LAZ have these values as coordinates, colours,
+        classification and two extra dimensions.
+
+        Raises:
+            InputError: if the ending is another one, or laspy is missing.
+        """
+        check_ending(path)
+        colors = np.asarray(self.taxonomy.colors, np.uint8)[self.labels]
+        raw = self.taxonomy.to_raw(self.labels)
+        if path.suffix != ".ply":
+            self._write_las(path, colors, raw)
+            return
+
+        columns = dict(zip("xyz", self.xyz.T, strict=True))
+        columns |= dict(zip(("red", "green", "blue"), colors.T, strict=True))
+        columns["class"] = raw.astype(np.int32)
+        columns["confidence"] = self.confidence
+        columns["sights"] = self.sights
+        with atomic_write(path) as part:
+            write_ply(part, columns)
+
+    def _write_las(self, path: Path, colors: np.ndarray, raw: np.ndarray) -> None:
+        import laspy
+
+        header = laspy.LasHeader(point_format=LAS_FORMAT, version="1.4")
+        header.add_extra_dims(
+            [laspy.ExtraBytesParams("confidence", "f4"), laspy.ExtraBytesParams("sights", "u2")]
+        )
+        header.offsets = self.xyz.min(axis=0).round() if len(self) else np.zeros(3)
+        header.scales = np.full(3, MILLIMETRE)
+        cloud = laspy.LasData(header)
+        cloud.x, cloud.y, cloud.z = self.xyz.T
+        cloud.red, cloud.green, cloud.blue = colors.T.astype(np.uint16) * FULL_COLOR
+        cloud.classification = raw.astype(np.uint8)
+        cloud.confidence = self.confidence
+        cloud.sights = self.sights
+        with atomic_write(path) as part:
+            cloud.write(part, do_compress=path.suffix == ".laz", laz_backend=laspy.LazBackend.Lazrs)
+
+
+class MapBuilder:
+    """Adds the scans of a drive to a map. Its memory grows with the world that the drive sees.
+
+    The class of a voxel is the class with the largest mean log score of its points, as in
+    `Consensus`, over all scans of the drive.
+
+    Args:
+        size: edge of the voxels, metres.
+        taxonomy: the classes of the scores.
+    """
+
+    def __init__(self, size: float, taxonomy: Taxonomy) -> None:
+        self.size = size
+        self.taxonomy = taxonomy
+        # Log scores and their weight; x, y, z within the voxel and the number of points.
+        self._table = VoxelTable(taxonomy.size + 1 + 4)
+        self._origin: NDArray[np.floating] | None = None
+
+    def add(self, xyz: NDArray[np.floating], scores: NDArray[np.floating], pose: Poses) -> None:
+        """Add a scan: points (N, 3) in metres, their scores (N, K), and the pose (4, 4)."""
+        if self._origin is None:
+            self._origin = np.floor(pose[:3, 3])
+        has_scores, _, weighted = weighted_logs(scores)
+        world = np.asarray(xyz, np.float64)[has_scores] @ pose[:3, :3].T
+        world += pose[:3, 3] - self._origin
+
+        index = np.floor(world / self.size).astype(np.int64)
+        within = (world - index * self.size).astype(np.float32)
+        keys, inverse = np.unique(keys_of(index), return_inverse=True)
+        values = np.concatenate((weighted, within, np.ones((len(world), 1), np.float32)), axis=1)
+        self._table.add(keys, sum_by(inverse, values, len(keys)))
+
+    def build(self, keeps_movable: bool = False) -> WorldMap:
+        """Return the map.
+
+        Args:
+            keeps_movable: whether voxels of vehicles, two-wheelers and people are kept.
+        """
+        keys, sums, scans = self._table.contents()
+        classes = self.taxonomy.size
+        logs = torch.from_numpy(sums[:, :classes] / sums[:, classes : classes + 1] / STEPS)
+        confidence, best = logs.softmax(dim=1).max(dim=1)
+        labels = (best + 1).to(torch.uint8).numpy()
+
+        xyz = index_of(keys) * self.size + sums[:, -4:-1] / sums[:, -1:]
+        if self._origin is not None:
+            xyz += self._origin
+        is_kept = np.ones(len(keys), bool) if keeps_movable else ~self._is_movable()[labels]
+        return WorldMap(
+            xyz[is_kept],
+            labels[is_kept],
+            confidence.numpy()[is_kept],
+            np.minimum(scans[is_kept], np.iinfo(np.uint16).max).astype(np.uint16),
+            self.taxonomy,
+        )
+
+    def _is_movable(self) -> NDArray[np.bool_]:
+        """Return (K + 1,) bool: the classes whose points may move, by train id."""
+        coarse = class_map("coarse")
+        ids = [coarse.target.names.index(name) for name in MOVABLE]
+        is_movable: NDArray[np.bool_] = np.isin(coarse.table(self.taxonomy), ids)
+        return is_movable
+
+
+def check_ending(path: Path) -> None:
+    """Raise InputError if a map cannot be written to a path because of its ending."""
+    if path.suffix not in SIGNATURES:
+        raise InputError(
+            f"{path}: expected a name that ends in {', '.join(SIGNATURES)}, found "
+            f"{path.suffix or 'no ending'}; rename it"
+        )
+    if path.suffix != ".ply" and find_spec("laspy") is None:
+        raise InputError(
+            f"{path}: expected the package laspy for this format, found none; run pip install "
+            '"amvnet[formats]", or write .ply'
+        )

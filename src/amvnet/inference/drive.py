@@ -1,0 +1,308 @@
+"""Segment drives: the scores of each scan are fused with those of the scans around it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amvnet.data.poses import Poses, check_rigid, read_poses
+from amvnet.data.spacing import evenly_spaced
+from amvnet.drives.consensus import Consensus, DriveScan, Fused
+from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit
+from amvnet.errors import InputError
+from amvnet.inference.listing import DatasetScan, InputScan, LoadedScan
+from amvnet.inference.pipeline import Outcome
+from amvnet.inference.segmentation import Segmentation
+from amvnet.inference.segmenter import Segmenter
+from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
+from amvnet.scan import AnyArray, Scan
+
+STANDING = -1.2  # height above which points of a normalised scan stand on the ground, metres
+FAR = 8.0  # distance up to which two scans are compared if they are not consecutive, metres
+LEAST_SCANS = 2  # smallest number of scans of a drive
+
+
+@dataclass(frozen=True)
+class DriveChoice:
+    """How the scores of drives are fused over time.
+
+    Attributes:
+        poses: the file of the poses; by default, they come from the dataset, or are estimated.
+        past_only: whether scans after a scan do not count.
+    """
+
+    poses: Path | None = None
+    past_only: bool = False
+
+
+@dataclass(frozen=True)
+class Drives:
+    """The poses of the scans of one or several drives.
+
+    Attributes:
+        poses: the pose (4, 4) of each scan, by the recording and the name of the scan.
+        of_files: whether the poses move the unchanged points of scan files, and not the points that
+            are normalised to the weights.
+        past_only: whether scans after a scan do not count.
+        table: maps the labels to other classes; by default, they stay unchanged.
+    """
+
+    poses: Mapping[tuple[str, str], Poses]
+    of_files: bool
+    past_only: bool = False
+    table: NDArray[np.uint8] | None = None
+
+    @property
+    def digest(self) -> str:
+        """A digest of all that labels depend on."""
+        values = np.array(list(self.poses.values())).tobytes()
+        return f"{hashlib.sha256(values).hexdigest()[:16]}, past only: {self.past_only}"
+
+    def consensus(self) -> Consensus:
+        """Return a new consensus for the scans of one drive."""
+        return Consensus(past_only=self.past_only)
+
+    def in_reach(
+        self, scans: Sequence[InputScan], chosen: Collection[InputScan]
+    ) -> list[InputScan]:
+        """Return the chosen scans and all scans on which their labels depend, in order."""
+        consensus = self.consensus()
+        needed: list[InputScan] = []
+        for _, drive in groupby(scans, key=lambda scan: scan.source):
+            members = list(drive)
+            is_needed = np.zeros(len(members), bool)
+            for index, scan in enumerate(members):
+                if scan in chosen:
+                    first = max(index - consensus.reach, 0)
+                    is_needed[first : index + consensus.ahead + 1] = True
+            needed += [scan for scan, is_in in zip(members, is_needed, strict=True) if is_in]
+        return needed
+
+    def fuse(self, outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
+        """Yield the outcomes of scans with the consensus of their drive as labels and scores.
+
+        Args:
+            outcomes: the scans of each drive in order. Broken scans are left out of the consensus.
+        """
+        broken = deque[Outcome]()
+        for (scan, loaded, result), scores, _ in self.consensus_of(outcomes, broken):
+            while broken:
+                yield broken.popleft()
+            assert isinstance(result, Segmentation)
+            yield scan, loaded, with_scores(result, scores, self.table)
+        yield from broken
+
+    def consensus_of(
+        self, outcomes: Iterable[Outcome], broken: deque[Outcome] | None = None
+    ) -> Iterator[Fused[Outcome]]:
+        """Yield the consensus on the scans of each drive.
+
+        Args:
+            outcomes: the scans of each drive in order.
+            broken: gets the scans that are broken, which are left out.
+        """
+        aside = deque[Outcome]() if broken is None else broken
+        for _, drive in groupby(outcomes, key=lambda outcome: outcome[0].source):
+            yield from self.consensus().stream(self._segmented(drive, aside))
+
+    def _segmented(
+        self, outcomes: Iterable[Outcome], broken: deque[Outcome]
+    ) -> Iterator[DriveScan[Outcome]]:
+        for outcome in outcomes:
+            scan, loaded, result = outcome
+            if loaded is None or isinstance(result, InputError):
+                broken.append(outcome)
+                continue
+            xyz = points_of(loaded, self.of_files)
+            yield DriveScan(outcome, xyz, result.scores, self.poses[key_of(scan)])
+
+
+def drive(
+    segmenter: Segmenter,
+    scans: Iterable[AnyArray | Scan],
+    poses: Iterable[Poses] | None = None,
+    past_only: bool = False,
+) -> Iterator[Segmentation]:
+    """Segment the scans of a drive, and fuse their scores over time (`Consensus`).
+
+    Only the scans in reach are in memory: 9 before a scan and 9 after it. A result follows 9 scans
+    later, or at once if only past scans count.
+
+    Args:
+        segmenter: segments each scan.
+        scans: consecutive scans of one recording, as `Segmenter.__call__` takes arrays and `Scan`s.
+        poses: the pose (4, 4) of each scan, which moves its points into the world, metres. By
+            default, KISS-ICP estimates them (`pip install "amvnet[drives]"`).
+        past_only: whether only scans before a scan count, as on a robot.
+
+    Yields:
+        The result of each scan, in order: the consensus gives `labels` and `scores`, the single
+        scan everything else.
+
+    Raises:
+        InputError: if a scan cannot be segmented, a pose is no rigid motion, there are fewer poses
+            than scans, or kiss-icp is missing.
+    """
+
+    def segmented() -> Iterator[DriveScan[Segmentation]]:
+        given = None if poses is None else iter(poses)
+        odometry = Odometry() if given is None else None
+        for index, points in enumerate(scans):
+            result = segmenter(points)
+            scan = result.require_origin().scan
+            if odometry is not None:
+                pose = odometry(scan.points[scan.valid, :3])
+            else:
+                assert given is not None
+                found = next(given, None)
+                if found is None:
+                    raise InputError(
+                        f"poses: expected a pose for each scan, found {index}; give one for each"
+                    )
+                pose = np.asarray(found, np.float64)
+                check_rigid(pose[None], "poses")
+            yield DriveScan(result, scan.points[:, :3], result.scores, pose)
+
+    for result, scores, _ in Consensus(past_only=past_only).stream(segmented()):
+        yield with_scores(result, scores)
+
+
+def with_scores(
+    result: Segmentation, scores: NDArray[np.float32], table: NDArray[np.uint8] | None = None
+) -> Segmentation:
+    """Return a result with other scores (N, K) and the labels that follow from them.
+
+    Args:
+        table: maps the labels to other classes; without it, they stay unchanged.
+    """
+    labels = np.where(result.labels > 0, scores.argmax(axis=1) + 1, 0).astype(np.uint8)
+    return replace(result, scores=scores, labels=labels if table is None else table[labels])
+
+
+def key_of(scan: InputScan) -> tuple[str, str]:
+    """Return the recording and the name of a scan, which belong to no other scan."""
+    return scan.source, scan.name
+
+
+def points_of(loaded: LoadedScan, of_files: bool) -> np.ndarray:
+    """Return the points (N, 3) of a scan that its pose moves."""
+    if of_files and loaded.file_xyz is not None:
+        return loaded.file_xyz
+    return loaded.scan.points[:, :3]
+
+
+def find_poses(
+    scans: Sequence[InputScan],
+    path: Path | None = None,
+    past_only: bool = False,
+    *,
+    is_one: bool = False,
+    progress: Progress = no_progress,
+    report: Reporter = report_nothing,
+) -> Drives:
+    """Find the poses of the scans of one or several drives, and check that they fit the scans.
+
+    They come from a file, from the dataset, or from KISS-ICP. A line for each drive says which.
+
+    Args:
+        scans: the scans; those of each recording are in order.
+        path: the file of the poses of the only drive (`read_poses`).
+        past_only: whether only scans before a scan will count.
+        is_one: whether all scans must be of one drive.
+        progress: called with the number of scans whose poses are estimated, and their total.
+        report: takes the lines.
+
+    Raises:
+        InputError: if a recording has a single scan; if the file does not have a pose for each
+            scan, or is given for several drives; if the poses do not fit the scans; or if a scan
+            cannot be read or kiss-icp is missing where poses are estimated.
+    """
+    sources: dict[str, list[InputScan]] = {}
+    for scan in scans:
+        sources.setdefault(scan.source, []).append(scan)
+    if (path is not None or is_one) and len(sources) > 1:
+        raise InputError(
+            f"expected the scans of one drive, found {len(sources)} recordings "
+            f"({', '.join(list(sources)[:3])}, ...); choose one, with --sequences or as INPUT"
+        )
+    for source, members in sources.items():
+        if len(members) < LEAST_SCANS:
+            raise InputError(
+                f"{source}: expected the consecutive scans of a drive, found a single scan; leave "
+                "--drive out, or give all scans"
+            )
+
+    found: dict[tuple[str, str], Poses] = {}
+    of_files = path is not None
+    for source, members in sources.items():
+        name = source
+        poses = None
+        if path is not None:
+            name = str(path)
+            poses = read_poses(path).at(_times(members), len(members))
+        elif isinstance(members[0], DatasetScan):
+            records = [scan.record for scan in members if isinstance(scan, DatasetScan)]
+            poses = members[0].dataset.poses(records)
+        where = "the file" if path is not None else "the dataset"
+        if poses is None:
+            poses = _estimated(members, progress)
+            where = "KISS-ICP"
+
+        check_rigid(poses, name)
+        check_fit(_pairs(members, poses, of_files), name)
+        metres = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+        report(f"{name}: a drive of {counted(len(members), 'scan')}, {metres:.0f} m by {where}")
+        found |= {key_of(scan): pose for scan, pose in zip(members, poses, strict=True)}
+    return Drives(found, of_files, past_only)
+
+
+def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:
+    odometry = Odometry()
+    poses = []
+    for index, scan in enumerate(scans):
+        progress(index, len(scans))
+        try:
+            loaded = scan.load().scan
+            poses.append(odometry(loaded.points[loaded.valid, :3]))
+        except InputError:  # the segmentation reports the broken scan
+            poses.append(poses[-1] if poses else np.eye(4))
+    progress(len(scans), len(scans))
+    return np.array(poses)
+
+
+def _times(scans: Sequence[InputScan]) -> list[float] | None:
+    """Return the times of scans whose names are numbers of seconds or nanoseconds, or None."""
+    times = []
+    for scan in scans:
+        with suppress(ValueError):
+            times.append(float(Path(scan.name).name.removesuffix(scan.path.suffix)))
+    if len(times) < len(scans):
+        return None
+    return [time * 1e-9 if time > 1e15 else time for time in times]
+
+
+def _pairs(scans: Sequence[InputScan], poses: Poses, of_files: bool) -> Iterator[Pair]:
+    """Yield pairs of scans that show whether the poses fit; unreadable scans show nothing."""
+    for first in evenly_spaced(range(len(scans) - 1), PAIRS):
+        # The farther apart two scans are, the more a wrong motion shows, if they see the same
+        # places.
+        ahead = poses[first + 1 : first + 1 + GAP, :3, 3] - poses[first, :3, 3]
+        is_near = np.linalg.norm(ahead, axis=1) < FAR
+        last = first + max(int(np.cumprod(is_near).sum()), 1)
+        with suppress(InputError):
+            before, after = (_standing(scans[index].load(), of_files) for index in (first, last))
+            yield Pair(before, after, np.linalg.inv(poses[first]) @ poses[last])
+
+
+def _standing(loaded: LoadedScan, of_files: bool) -> np.ndarray:
+    """Return the points of a scan that stand above the ground."""
+    is_standing = loaded.scan.valid & (loaded.scan.points[:, 2] > STANDING)
+    return points_of(loaded, of_files)[is_standing]

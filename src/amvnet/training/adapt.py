@@ -1,0 +1,286 @@
+"""Teach networks by the consensus of an unlabelled drive."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import Recipe
+from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
+from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR
+from amvnet.errors import InputError
+from amvnet.files import atomic_write, inside
+from amvnet.inference.drive import Drives
+from amvnet.inference.listing import InputScan
+from amvnet.inference.scan_stream import stream_scans
+from amvnet.inference.segmentation import Segmentation
+from amvnet.inference.segmenter import Segmenter
+from amvnet.progress import Progress, Reporter, no_progress, report_nothing
+from amvnet.scan import Scan
+from amvnet.sensors.intensity import network_records
+from amvnet.training.plan import Plan, sized_by_init
+from amvnet.training.run import train
+from amvnet.training.run_folder import check_folder
+from amvnet.weights.file import Weights, load, save
+
+TEACHER = "teacher"  # the folder of the labels that teach, in the folder of the run
+FIGURES = "figures.json"  # the figures of the scans under the weights that taught, in that folder
+# A point teaches if the probability of its consensus is larger, and enough scans saw its voxel.
+LEAST_PROBABILITY = 0.6
+LEAST_SIGHTS = 3
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures of labels that need no truth.
+
+    Attributes:
+        uncertain: share of the points on which the networks disagree, in [0, 1].
+        agreement: share of the points to which both networks give the same class, in [0, 1].
+        consistency: share of the points whose label is that of the consensus, in [0, 1].
+    """
+
+    uncertain: float
+    agreement: float
+    consistency: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.uncertain:.1%} of the points uncertain, both networks agree on "
+            f"{self.agreement:.1%}, the consensus on {self.consistency:.1%}"
+        )
+
+    def is_better_than(self, other: Figures) -> bool:
+        """Return whether fewer points are uncertain, and the networks agree on more."""
+        return self.uncertain < other.uncertain and self.agreement > other.agreement
+
+
+class TaughtScans(Dataset):
+    """The scans of drives, with the labels that their consensus gives.
+
+    `Dataset` documents the methods and their errors.
+
+    Args:
+        scans: the scans, normalised to the weights.
+        folder: the folder of the labels.
+        weights: the weights that gave the labels.
+    """
+
+    def __init__(self, scans: Sequence[InputScan], folder: Path, weights: Weights) -> None:
+        super().__init__(folder, weights.taxonomy)
+        self._scans = {label_path(scan): scan for scan in scans}
+        # The scans are normalised to what the weights expect, and so will be the scans to label.
+        _, self.sensor_record = next(network_records(weights.training), ("", {}))
+
+    def official(self, split: str) -> tuple[str, ...]:
+        """Return the recordings; all of them train."""
+        check_split(self.spec, split, ("train", "all"))
+        return tuple(dict.fromkeys(scan.source for scan in self._scans.values()))
+
+    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+        """Return the scans of some recordings, in order."""
+        records = []
+        for path, scan in self._scans.items():
+            if scan.source in sequences:
+                labels = self.root / path
+                name = str(path.with_suffix(""))
+                records.append(ScanRecord(name, scan.source, scan.path, labels, str(path)))
+        return records
+
+    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+        """Read one scan, normalised to the weights, and what its consensus teaches."""
+        scan = self._scans[Path(record.prediction)].load().scan
+        ids = self.raw_labels(record, len(scan)) if labels else None
+        return replace(scan, labels=ids, name=record.name)
+
+    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+        """Return the (N,) train ids that teach; 0 for points that teach nothing."""
+        assert record.labels_path is not None
+        ids: np.ndarray = np.load(record.labels_path, allow_pickle=False)
+        return ids
+
+    def train_ids_by_raw(self) -> np.ndarray:
+        """Return each train id as its own raw id."""
+        return np.arange(self.taxonomy.size + 1, dtype=np.int16)
+
+
+def label_path(scan: InputScan) -> Path:
+    """Return the path of the labels that a scan teaches, relative to their folder."""
+    recording = scan.source.strip("/").replace("/", "_")
+    return Path(recording) / scan.scores_path.with_suffix(".npy").name
+
+
+def teach(
+    scans: Sequence[InputScan],
+    drives: Drives | None,
+    segmenter: Segmenter,
+    folder: Path | None = None,
+    progress: Progress = no_progress,
+) -> Figures:
+    """Label the scans of drives, and write what their consensus teaches.
+
+    Args:
+        scans: the scans, those of each drive in order.
+        drives: their poses, or None if each scan teaches by its own labels.
+        segmenter: labels the scans by both networks.
+        folder: the folder for the labels, or None to write nothing.
+        progress: called with the number of scans that are done, and their total.
+
+    Raises:
+        InputError: if a scan cannot be read or segmented.
+    """
+    counts = np.zeros(4)  # of points, of uncertain ones, and of those that agree in two ways
+    for scan, result, probabilities, sights in _fused(scans, drives, segmenter, progress):
+        is_valid = result.labels > 0
+        labels = np.where(probabilities.any(axis=1), probabilities.argmax(axis=1) + 1, 0)
+        assert result.rv is not None
+        assert result.bev is not None
+        agrees = result.rv.argmax(axis=1) == result.bev.argmax(axis=1)
+        for index, chosen in enumerate(
+            (is_valid, result.uncertain, agrees & is_valid, (labels == result.labels) & is_valid)
+        ):
+            counts[index] += np.count_nonzero(chosen)
+
+        if folder is not None:
+            teaches = (probabilities.max(axis=1) > LEAST_PROBABILITY) & (sights >= LEAST_SIGHTS)
+            ids = np.where(teaches, labels, 0).astype(np.uint8)
+            with atomic_write(inside(folder, label_path(scan))) as part, part.open("wb") as file:
+                np.save(file, ids)
+    return Figures(*(float(share) for share in counts[1:] / max(counts[0], 1)))
+
+
+def _fused(
+    scans: Sequence[InputScan],
+    drives: Drives | None,
+    segmenter: Segmenter,
+    progress: Progress,
+) -> Iterator[tuple[InputScan, Segmentation, np.ndarray, np.ndarray]]:
+    """Yield each scan, its result, and the probabilities (N, K) and sights (N,) of its points."""
+    outcomes = stream_scans(
+        scans,
+        lambda scan: scan.load(),
+        lambda scan, loaded: (scan, loaded, segmenter(loaded.scan)),
+        segmenter.at_once,
+        progress,
+    )
+    if drives is not None:
+        for (scan, _, result), probabilities, sights in drives.consensus_of(outcomes):
+            assert isinstance(result, Segmentation)
+            yield scan, result, probabilities, sights
+        return
+    for scan, _, result in outcomes:
+        yield scan, result, result.probabilities, np.full(len(result), LEAST_SIGHTS)
+
+
+def adapt(
+    scans: Sequence[InputScan],
+    drives: Drives | None,
+    weights: Weights,
+    make_segmenter: Callable[[Weights], Segmenter],
+    make_plan: Callable[[Dataset], Plan],
+    *,
+    progress: Callable[[str], AbstractContextManager[Progress]],
+    report: Reporter = report_nothing,
+) -> Path:
+    """Teach both networks by the consensus of their own labels over drives.
+
+    Args:
+        scans: the scans, those of each drive in order.
+        drives: their poses, or None if each scan teaches by its own labels.
+        weights: the weights that teach, and that the training begins with.
+        make_segmenter: returns the segmenter of some weights.
+        make_plan: returns the plan of the training, given the scans with their labels.
+        progress: returns a context that shows the progress of a step with a name.
+        report: takes a line about what happens.
+
+    Returns:
+        The path of the weights: the trained ones, or `weights` if they are not better.
+
+    Raises:
+        InputError: if a scan cannot be read; or as `train`.
+    """
+    plan = make_plan(TaughtScans(scans, Path(), weights))
+    folder = plan.out / TEACHER
+    request = _digest(scans, drives, weights)
+    before = _read_figures(folder, request, plan.resume)
+    if before is None:
+        check_folder(plan)
+        with progress("labelling") as step:
+            before = teach(scans, drives, make_segmenter(weights), folder, step)
+        with atomic_write(folder / FIGURES) as part:
+            part.write_text(json.dumps({"request": request, **asdict(before)}))
+    report(f"before: {before}")
+
+    path = train(make_plan(TaughtScans(scans, folder, weights)), "all", weights)
+    with progress("comparing") as step:
+        after = teach(scans, drives, make_segmenter(load(path)), progress=step)
+    report(f"after: {after}")
+    if not after.is_better_than(before):
+        save(weights, path)
+        report("the labels are not surer than before, so the weights stay as they were")
+    return path
+
+
+def _digest(scans: Sequence[InputScan], drives: Drives | None, weights: Weights) -> str:
+    """Return a digest of all that the labels depend on."""
+    names = [(scan.source, scan.name) for scan in scans]
+    poses = None if drives is None else drives.digest
+    return hashlib.sha256(repr((names, poses, weights.digests())).encode()).hexdigest()[:16]
+
+
+def _read_figures(folder: Path, request: str, resume: bool) -> Figures | None:
+    """Return the figures of an earlier call that wrote all labels, or None if there was none.
+
+    Raises:
+        InputError: if the earlier call is not to be resumed, or was another one.
+    """
+    try:
+        values = json.loads((folder / FIGURES).read_text())
+        earlier = values.pop("request")
+        figures = Figures(**values)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return None
+    if not resume:
+        raise InputError(
+            f"{folder.parent}: expected no earlier run, found one; add --resume or give another "
+            "folder"
+        )
+    if earlier != request:
+        raise InputError(
+            f"{folder.parent}: expected the scans, poses and weights of the earlier run, found "
+            "others; give another folder"
+        )
+    return figures
+
+
+def recipe_for(weights: Weights, epochs: int | None, streets: float, seed: int | None) -> Recipe:
+    """Return the recipe `adapt` with some values.
+
+    Raises:
+        InputError: if the streets of the weights' sensor cannot be simulated.
+    """
+    simulated = CLASSES_BY_SENSOR.get(weights.sensor)
+    if streets and (simulated is None or simulated.classes != weights.taxonomy.classes):
+        raise InputError(
+            f"expected weights of a sensor and classes that can be simulated "
+            f"({', '.join(CLASSES_BY_SENSOR)}), found {weights.sensor} with the classes of "
+            f"{weights.taxonomy.name}; add --streets 0"
+        )
+    recipe = sized_by_init(load_recipe("adapt"), weights)
+    training = replace(recipe.training, others=streets)
+    if epochs is not None:
+        training = replace(
+            training,
+            rv=replace(training.rv, epochs=epochs),
+            bev=replace(training.bev, epochs=epochs),
+        )
+    if seed is not None:
+        training = replace(training, seed=seed)
+    return replace(recipe, training=training)

@@ -1,0 +1,168 @@
+"""Poses from files: KITTI's, TUM's and NumPy's format, and what is wrong with others."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.poses import read_poses
+
+from fixtures.commands import fails
+from fixtures.drives import TO_CAMERA, drive_poses, write_drive
+from fixtures.tiny import GOLDEN
+
+POSES = drive_poses()
+
+
+def write_tum(path: Path, poses: np.ndarray = POSES, first: float = 100.0) -> Path:
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    times = first + 0.1 * np.arange(len(poses))
+    np.savetxt(path, np.column_stack([times, poses[:, :3, 3], quaternions]), header="time x y z")
+    return path
+
+
+def write_kitti(path: Path, poses: np.ndarray = POSES) -> Path:
+    np.savetxt(path, poses[:, :3].reshape(-1, 12))
+    return path
+
+
+def write_numpy(path: Path, poses: np.ndarray = POSES) -> Path:
+    np.save(path.with_suffix(".npy"), poses)
+    return path.with_suffix(".npy")
+
+
+@pytest.mark.parametrize("write", [write_kitti, write_tum, write_numpy])
+def test_every_format_gives_the_same_poses(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    path = write(tmp_path / "poses.txt")
+    np.testing.assert_allclose(read_poses(path).at(None, len(POSES)), POSES, atol=1e-9)
+
+
+def test_poses_of_the_camera_become_poses_of_the_lidar(tmp_path: Path) -> None:
+    dataset = open_dataset(str(write_drive(tmp_path)))
+    records = dataset.records(["00"])
+    poses = dataset.poses(records)
+    assert poses is not None
+    np.testing.assert_allclose(poses, POSES, atol=1e-9)
+
+    # The number of a scan is the line of its pose.
+    some = dataset.poses(records[3:5])
+    assert some is not None
+    np.testing.assert_allclose(some, POSES[3:5], atol=1e-9)
+
+
+def test_a_dataset_without_poses_has_none(tmp_path: Path) -> None:
+    dataset = open_dataset(str(write_drive(tmp_path)))
+    (tmp_path / "sequences/00/poses.txt").unlink()
+    assert dataset.poses(dataset.records(["00"])) is None
+
+
+def test_poses_of_nuscenes_are_those_of_the_car_and_of_its_sensor() -> None:
+    """The reference turns a point by each quaternion, which the tables round."""
+    dataset = open_dataset(str(GOLDEN / "nuscenes"))
+    records = dataset.records(dataset.official("all"))
+    poses = dataset.poses(records)
+    assert poses is not None
+    tables = {}
+    for name in ("sample_data", "ego_pose", "calibrated_sensor"):
+        rows = json.loads((GOLDEN / f"nuscenes/v1.0-mini/{name}.json").read_text())
+        tables[name] = {row["token"]: row for row in rows}
+
+    point = np.array([3.0, -2.0, 0.5])
+    for record, pose in zip(records, poses, strict=True):
+        row = tables["sample_data"][record.name]
+        moved = point
+        for table, key in (
+            ("calibrated_sensor", "calibrated_sensor_token"),
+            ("ego_pose", "ego_pose_token"),
+        ):
+            motion = tables[table][row[key]]
+            w, *vector = motion["rotation"]
+            axis = np.array(vector)
+            turned = moved + 2 * np.cross(axis, np.cross(axis, moved) + w * moved)
+            moved = turned + motion["translation"]
+        np.testing.assert_allclose(pose[:3, :3] @ point + pose[:3, 3], moved, atol=1e-3)
+
+
+def test_poses_are_interpolated_at_the_times_of_the_scans(tmp_path: Path) -> None:
+    file = read_poses(write_tum(tmp_path / "tum.txt"))
+    halfway = file.at([100.05, 100.35], 2)
+    for pose, before in zip(halfway, (0, 3), strict=True):
+        middle = (POSES[before, :3, 3] + POSES[before + 1, :3, 3]) / 2
+        np.testing.assert_allclose(pose[:3, 3], middle, atol=1e-9)
+        turn = np.arctan2(pose[1, 0], pose[0, 0])
+        assert turn == pytest.approx(0.03 * (before + 0.5))
+
+
+def test_times_that_do_not_overlap_are_one_line(tmp_path: Path) -> None:
+    file = read_poses(write_tum(tmp_path / "tum.txt"))
+    fails(lambda: file.at([5.0, 5.1], 2), "tum.txt", "5.00 to 5.10", "100.00 to 102.30")
+
+
+@pytest.mark.parametrize("write", [write_kitti, write_tum])
+def test_fewer_poses_than_scans_are_one_line(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    file = read_poses(write(tmp_path / "poses.txt"))
+    fails(lambda: file.at(None, 30), "poses.txt", "30 scans", "24 poses")
+
+
+def with_nan(poses: np.ndarray) -> np.ndarray:
+    poses = poses.copy()
+    poses[2, 0, 3] = np.nan
+    return poses
+
+
+def scaled(poses: np.ndarray) -> np.ndarray:
+    poses = poses.copy()
+    poses[:, :3, :3] *= 1.1
+    return poses
+
+
+def mirrored(poses: np.ndarray) -> np.ndarray:
+    return poses @ np.diag([1.0, -1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "word"), [(with_nan, "no number"), (scaled, "no rotation"), (mirrored, "no rotation")]
+)
+def test_what_is_no_rigid_motion_is_one_line(
+    tmp_path: Path, spoil: Callable[[np.ndarray], np.ndarray], word: str
+) -> None:
+    path = write_kitti(tmp_path / "poses.txt", spoil(POSES))
+    fails(lambda: read_poses(path), "poses.txt", word)
+
+
+def test_angles_in_place_of_quaternions_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "tum.txt"
+    path.write_text("0 1 2 3 0 0 90 0\n1 1 2 3 0 0 91 0\n")
+    fails(lambda: read_poses(path), "quaternions", "0 0 90 0")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"1 2 3\n", b"x y z\n", b"\x93NUMPY", bytes(100), b"1 " * 12 + b"\n1\n"]
+)
+@pytest.mark.parametrize("name", ["poses.txt", "poses.npy"])
+def test_another_file_is_one_line(tmp_path: Path, name: str, content: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    fails(lambda: read_poses(path), name, "expected")
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    fails(lambda: read_poses(tmp_path / "none.txt"), "none.txt", "No such file")
+
+
+def test_pickled_poses_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "poses.npy"
+    np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    fails(lambda: read_poses(path), "poses.npy")
+
+
+def test_a_calibration_without_tr_is_one_line(tmp_path: Path) -> None:
+    write_kitti(tmp_path / "poses.txt", TO_CAMERA @ POSES @ np.linalg.inv(TO_CAMERA))
+    (tmp_path / "calib.txt").write_text("P0: 1 0 0\n")
+    fails(lambda: read_poses(tmp_path / "poses.txt"), "calib.txt", "Tr")

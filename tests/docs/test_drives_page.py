@@ -1,0 +1,25 @@
+"""The commands and the Python of the page on drives run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fixtures.pages import Changes, DocsPage, execute, run
+
+PAGE = DocsPage("docs/drives.md")
+CHANGES = Changes(values={"simulate": {"--scans": 3}})
+
+
+@pytest.mark.full
+def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("embreex")
+    pytest.importorskip("kiss_icp")
+    monkeypatch.chdir(tmp_path)
+    run(PAGE.commands, CHANGES)
+    assert len(list(Path("labels").rglob("*.label"))) == 3
+    assert Path("map.html").stat().st_size
+
+    variables = execute(PAGE.blocks("python"))
+    assert "uncertain" in repr(variables["result"])

@@ -1,0 +1,156 @@
+"""The map of a drive: its voxels, its files and its figures."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+import amvnet
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.drives.consensus import LEAST
+from amvnet.drives.world_map import MapBuilder
+from amvnet.weights.file import save
+
+from fixtures.commands import refusal, run_cli, succeed
+from fixtures.drives import drive_poses, write_drive
+from fixtures.tiny import fresh_weights
+
+ROAD = 9  # train ids of SemanticKITTI
+CAR = 1
+SIZE = 0.5
+
+
+def scores_of(labels: np.ndarray, probability: float = 0.9) -> np.ndarray:
+    """Return scores (N, 19) with a probability for each label, and equal ones for the others."""
+    scores = np.full((len(labels), 19), (1 - probability) / 18)
+    scores[np.arange(len(labels)), labels - 1] = probability
+    return scores
+
+
+def test_voxels_equal_a_loop_over_the_points() -> None:
+    rng = np.random.default_rng(0)
+    builder = MapBuilder(SIZE, SEMANTICKITTI)
+    origin = np.array([400_000.3, 5_000_000.7, 100])
+    points: defaultdict[tuple[int, ...], list[np.ndarray]] = defaultdict(list)
+    votes: defaultdict[tuple[int, ...], list[tuple[float, np.ndarray]]] = defaultdict(list)
+    sights: Counter[tuple[int, ...]] = Counter()
+    for pose in drive_poses(5):
+        pose[:3, 3] += origin
+        xyz = rng.uniform(-3, 3, (80, 3))
+        scores = rng.dirichlet(np.full(19, 0.2), 80)
+        builder.add(xyz, scores, pose)
+
+        seen = set()
+        for point, row in zip(xyz @ pose[:3, :3].T + pose[:3, 3], scores, strict=True):
+            voxel = tuple(np.floor((point - np.floor(origin)) / SIZE).astype(int))
+            points[voxel].append(point)
+            weight = max(round(float(row.max() ** 2 * 16)), 1)
+            votes[voxel].append((weight, np.round(np.log(np.maximum(row, LEAST)) * 16) / 16))
+            seen.add(voxel)
+        sights.update(seen)
+
+    world = builder.build(keeps_movable=True)
+    assert len(world) == len(points)
+    places = np.floor((world.xyz - np.floor(origin)) / SIZE + 1e-9).astype(int)
+    for place, xyz, label, confidence, count in zip(
+        places, world.xyz, world.labels, world.confidence, world.sights, strict=True
+    ):
+        voxel = tuple(place)
+        np.testing.assert_allclose(xyz, np.mean(points[voxel], axis=0), atol=1e-4)
+        total = sum(weight for weight, _ in votes[voxel])
+        logs = sum(weight * values for weight, values in votes[voxel]) / total
+        shares = np.exp(logs) / np.exp(logs).sum()
+        assert label == shares.argmax() + 1
+        assert confidence == pytest.approx(shares.max(), abs=1e-4)
+        assert count == sights[voxel]
+
+
+def test_what_may_move_is_left_out_unless_it_is_wanted() -> None:
+    builder = MapBuilder(SIZE, SEMANTICKITTI)
+    xyz = np.array([[1.1, 0.1, 0.1], [5.1, 0.1, 0.1]])
+    builder.add(xyz, scores_of(np.array([ROAD, CAR])), np.eye(4))
+    assert builder.build().labels.tolist() == [ROAD]
+    assert sorted(builder.build(keeps_movable=True).labels.tolist()) == [CAR, ROAD]
+
+
+def test_a_car_that_drives_away_leaves_the_road() -> None:
+    builder = MapBuilder(SIZE, SEMANTICKITTI)
+    xyz = np.array([[1.1, 0.1, 0.1]])
+    for label in (CAR, ROAD, ROAD):
+        builder.add(xyz, scores_of(np.array([label])), np.eye(4))
+    world = builder.build()
+    assert (world.labels.tolist(), world.sights.tolist()) == ([ROAD], [3])
+
+
+def test_a_map_of_nothing_has_no_voxels(tmp_path: Path) -> None:
+    world = MapBuilder(SIZE, SEMANTICKITTI).build()
+    for ending in ("ply", "las", "laz"):
+        world.write(tmp_path / f"map.{ending}")
+    assert len(PlyData.read(tmp_path / "map.ply")["vertex"]) == 0
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("world")
+    write_drive(root / "data")
+    save(fresh_weights(), root / "w.safetensors")
+    return root
+
+
+def command(world: Path, out: Path, *options: object) -> str:
+    words = " ".join(map(str, options))
+    return f"map {world}/data --weights {world}/w.safetensors --out {out} {words}"
+
+
+def test_both_formats_read_back_equal_and_as_the_figures_say(world: Path, tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    options = ("--keep-movable", "--json", tmp_path / "map.json")
+    succeed(command(world, tmp_path / "map.ply", *options))
+    succeed(command(world, tmp_path / "map.laz", "--keep-movable"))
+    figures = json.loads((tmp_path / "map.json").read_text())
+
+    vertices = PlyData.read(tmp_path / "map.ply")["vertex"]
+    cloud = laspy.read(tmp_path / "map.laz")
+    assert len(vertices) == len(cloud) == figures["voxels"] == sum(figures["classes"].values())
+    for axis in "xyz":
+        np.testing.assert_allclose(vertices[axis], cloud[axis], atol=0.00051)
+    np.testing.assert_array_equal(vertices["class"], cloud.classification)
+    np.testing.assert_array_equal(vertices["sights"], cloud.sights)
+    np.testing.assert_allclose(vertices["confidence"], cloud.confidence)
+    np.testing.assert_array_equal(vertices["red"], np.asarray(cloud.red) // 257)
+
+    ids, counts = np.unique(SEMANTICKITTI.to_train(vertices["class"]), return_counts=True)
+    of_file = {SEMANTICKITTI.names[index]: count for index, count in zip(ids, counts, strict=True)}
+    assert of_file == {name: count for name, count in figures["classes"].items() if count}
+
+
+def test_the_viewer_and_the_readers_take_a_map(world: Path, tmp_path: Path) -> None:
+    succeed(command(world, tmp_path / "map.ply"))
+    succeed(f"view {tmp_path}/map.ply --labels {tmp_path}/map.ply --html {tmp_path}/map.html")
+    vertices = PlyData.read(tmp_path / "map.ply")["vertex"]
+    assert len(amvnet.read(tmp_path / "map.ply")) == len(vertices)
+
+
+def test_a_map_replaces_maps_only(world: Path, tmp_path: Path) -> None:
+    out = tmp_path / "map.ply"
+    out.write_text("ply\nmy own points")
+    assert "--overwrite" in refusal(command(world, out))
+    assert "a map" in refusal(command(world, out, "--overwrite"))
+    assert out.read_text() == "ply\nmy own points"
+    assert ".laz" in refusal(command(world, tmp_path / "map.txt"))
+
+    succeed(command(world, tmp_path / "other.ply"))
+    assert run_cli(*command(world, tmp_path / "other.ply", "--overwrite").split())[0] == 0
+
+
+def test_a_map_is_of_one_drive(world: Path, tmp_path: Path) -> None:
+    for sequence in ("01", "02"):
+        write_drive(tmp_path / "data", sequence, 3)
+    line = f"map {tmp_path}/data --weights {world}/w.safetensors --out {tmp_path}/map.ply"
+    assert "2 recordings" in refusal(line)
+    succeed(f"{line} --sequences 02")

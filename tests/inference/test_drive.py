@@ -1,0 +1,211 @@
+"""Drives: labels by the consensus of scans, with the commands and in Python."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import amvnet
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.poses import Poses
+from amvnet.drives.odometry import Odometry, Pair, check_fit
+from amvnet.inference.pipeline import Pipeline
+from amvnet.weights.file import save
+
+from fixtures.commands import fails, files, refusal, run_cli, succeed
+from fixtures.drives import SCANS, drive_poses, drive_scans, write_drive
+from fixtures.tiny import fresh_weights
+
+POSES = drive_poses()
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a drive in SemanticKITTI's layout, weights, and the labels of the drive."""
+    root = tmp_path_factory.mktemp("world")
+    write_drive(root / "data")
+    save(fresh_weights(), root / "w.safetensors")
+    succeed(predict(root, root / "labels"))
+    return root
+
+
+def predict(world: Path, out: Path, *options: object) -> str:
+    words = " ".join(map(str, options))
+    return f"predict {world}/data --weights {world}/w.safetensors --drive --out {out} {words}"
+
+
+def labels_in(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in files(folder)}
+
+
+def test_predict_writes_the_labels_of_python(world: Path) -> None:
+    segmenter = amvnet.load(world / "w.safetensors")
+    dataset = open_dataset(str(world / "data"))
+    records = dataset.records(["00"])
+    scans = (dataset.read(record) for record in records)
+    alone = 0
+    for record, result in zip(records, amvnet.drive(segmenter, scans, POSES), strict=True):
+        written = dataset.read_prediction(record, world / "labels")
+        np.testing.assert_array_equal(result.labels, written)
+        np.testing.assert_allclose(result.scores.sum(axis=1), 1, atol=1e-5)
+        alone += int(np.count_nonzero(segmenter(dataset.read(record)).labels != written))
+    assert alone > 0, "the consensus changes labels"
+
+
+def test_past_scans_alone_give_other_labels_at_once(world: Path) -> None:
+    segmenter = amvnet.load(world / "w.safetensors")
+    read: list[int] = []
+
+    def scans() -> Iterator[np.ndarray]:
+        for index, (points, _) in enumerate(drive_scans()):
+            read.append(index)
+            yield points
+
+    results = amvnet.drive(segmenter, scans(), POSES, past_only=True)
+    for index, _ in enumerate(results):
+        assert len(read) == index + 1
+
+
+def test_an_interrupted_run_resumes_to_the_same_labels(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = Pipeline.write
+    written: list[object] = []
+
+    def write_twelve(self: Pipeline, *arguments: Any) -> Any:
+        if len(written) == 12:
+            raise RuntimeError("the power is gone")
+        written.append(arguments)
+        return write(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Pipeline, "write", write_twelve)
+        with pytest.raises(RuntimeError, match="power"):
+            run_cli(*predict(world, tmp_path).split())
+    assert len(files(tmp_path) - {".unfinished.jsonl"}) == 12
+
+    succeed(predict(world, tmp_path, "--resume"))
+    assert labels_in(tmp_path) == labels_in(world / "labels")
+
+
+def test_a_run_is_not_resumed_with_other_poses(world: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "poses.npy", POSES)
+    out = tmp_path / "out"
+    succeed(predict(world, out, f"--poses {tmp_path}/poses.npy"))
+    np.save(tmp_path / "poses.npy", np.linalg.inv(POSES[2]) @ POSES)
+    assert "drive" in refusal(predict(world, out, f"--resume --poses {tmp_path}/poses.npy"))
+    command = f"predict {world}/data --weights {world}/w.safetensors --out {out} --resume"
+    assert "drive" in refusal(command)
+
+
+def of_camera(poses: Poses) -> Poses:
+    turn = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    return turn @ poses @ np.linalg.inv(turn)
+
+
+def stretched(poses: Poses) -> Poses:
+    poses = poses.copy()
+    poses[:, :3, 3] *= 100  # centimetres
+    return poses
+
+
+def backwards(poses: Poses) -> Poses:
+    return poses[::-1].copy()
+
+
+def fewer(poses: Poses) -> Poses:
+    return poses[1:]
+
+
+def lost(poses: Poses) -> Poses:
+    poses = poses.copy()
+    poses[3:] = np.nan
+    return poses
+
+
+@pytest.mark.parametrize("spoil", [of_camera, stretched, backwards, fewer, lost])
+def test_poses_that_do_not_fit_are_one_line_and_nothing_is_written(
+    world: Path, tmp_path: Path, spoil: Callable[[Poses], Poses]
+) -> None:
+    np.save(tmp_path / "poses.npy", spoil(POSES))
+    line = refusal(predict(world, tmp_path / "out", f"--poses {tmp_path}/poses.npy"))
+    assert "poses.npy" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_poses_of_a_standing_car_fit() -> None:
+    points = drive_scans(2)[0][0][:, :3]
+    check_fit([Pair(points, points + 0.01, np.eye(4))], "poses")
+    moved = np.eye(4)
+    moved[0, 3] = 3
+    fails(lambda: check_fit([Pair(points, points + 0.01, moved)], "poses"), "poses", "apart")
+
+
+def test_a_drive_needs_scans_of_one_recording_in_a_row(world: Path, tmp_path: Path) -> None:
+    scan = world / "data/sequences/00/velodyne/000000.bin"
+    command = f"predict {scan} --weights {world}/w.safetensors --out {tmp_path}/out"
+    assert "single scan" in refusal(f"{command} --drive")
+    assert "--drive" in refusal(f"{command} --poses {scan}")
+    assert "--drive" in refusal(f"{command} --past-only")
+
+    write_drive(tmp_path / "data", "01", 3)
+    write_drive(tmp_path / "data", "02", 3)
+    np.save(tmp_path / "poses.npy", POSES)
+    words = f"--weights {world}/w.safetensors --out {tmp_path}/out --drive"
+    line = refusal(f"predict {tmp_path}/data {words} --poses {tmp_path}/poses.npy")
+    assert "2 recordings" in line
+
+
+def test_a_broken_scan_is_left_out_of_its_drive(world: Path, tmp_path: Path) -> None:
+    write_drive(tmp_path / "data")
+    path = tmp_path / "data/sequences/00/velodyne/000003.bin"
+    path.write_bytes(path.read_bytes()[:-3])
+    code, error = run_cli(
+        *predict(tmp_path, tmp_path / "out")
+        .replace(f"{tmp_path}/w.safetensors", f"{world}/w.safetensors")
+        .split()
+    )
+    assert code == 3
+    assert "000003.bin" in error
+    assert len(files(tmp_path / "out")) == SCANS - 1
+
+
+def test_evaluate_scores_the_labels_that_predict_writes(world: Path, tmp_path: Path) -> None:
+    figures = {}
+    data = f"{world}/data --split all"
+    for name, source in (
+        ("drive", f"--weights {world}/w.safetensors --drive"),
+        ("predictions", f"--predictions {world}/labels"),
+    ):
+        succeed(f"evaluate {data} {source} --json {tmp_path}/{name}.json")
+        figures[name] = json.loads((tmp_path / f"{name}.json").read_text())["methods"][name]
+    assert figures["drive"] == figures["predictions"]
+    assert "--weights" in refusal(f"evaluate {data} --predictions {world}/labels --drive")
+
+
+# ---- estimated poses
+
+
+def test_poses_are_estimated(world: Path, tmp_path: Path) -> None:
+    pytest.importorskip("kiss_icp")
+    odometry = Odometry()
+    poses = np.array([odometry(points[:, :3]) for points, _ in drive_scans(count=20_000)])
+    np.testing.assert_allclose(poses[:, :3, 3], POSES[:, :3, 3], atol=0.15)
+
+
+def test_without_poses_and_kiss_icp_one_line_says_what_to_do(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "kiss_icp", None)
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
+    write_drive(tmp_path / "data")
+    (tmp_path / "data/sequences/00/poses.txt").unlink()
+    command = f"predict {tmp_path}/data --weights {world}/w.safetensors --out {tmp_path}/out"
+    assert 'pip install "amvnet[drives]"' in refusal(f"{command} --drive")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,135 @@
+"""Weights are taught by the consensus of an unlabelled drive."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import amvnet
+from amvnet.data.datasets.open import open_dataset
+from amvnet.drives.consensus import Consensus, DriveScan
+from amvnet.training import adapt as adapting
+from amvnet.training.adapt import LEAST_PROBABILITY, LEAST_SIGHTS, Figures
+from amvnet.weights.file import load, save
+
+from fixtures.commands import refusal, run_cli, succeed
+from fixtures.drives import drive_poses, write_drive
+from fixtures.tiny import fresh_weights
+
+SCANS = 4
+TEACHER = "teacher/00"
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a drive without labels, weights, and a run that adapts them."""
+    root = tmp_path_factory.mktemp("world")
+    write_drive(root / "data", scans=SCANS)
+    shutil.rmtree(root / "data/sequences/00/labels")
+    save(fresh_weights(), root / "w.safetensors")
+    with pytest.MonkeyPatch.context() as patch:
+        # Tiny networks are never sure; any of their labels may teach.
+        patch.setattr(adapting, "LEAST_PROBABILITY", 0.07)
+        patch.setattr(Figures, "is_better_than", lambda self, other: True)
+        succeed(command(root, root / "run"))
+    return root
+
+
+def command(world: Path, out: Path, *options: object) -> str:
+    words = " ".join(map(str, options))
+    shared = f"--weights {world}/w.safetensors --out {out} --streets 0 --epochs 1"
+    return f"adapt {world}/data {shared} {words}"
+
+
+def test_both_networks_learn_and_the_head_stays(world: Path) -> None:
+    before = load(world / "w.safetensors")
+    after = load(world / "run")
+    assert after.parts == before.parts
+    assert after.digest("range_net") != before.digest("range_net")
+    assert after.digest("polar_net") != before.digest("polar_net")
+    assert after.digest("point_head") == before.digest("point_head")
+
+
+def test_points_teach_that_are_sure_and_seen_by_several_scans(world: Path) -> None:
+    segmenter = amvnet.load(world / "w.safetensors")
+    dataset = open_dataset(str(world / "data"))
+    records = dataset.records(["00"])
+    results = [segmenter(dataset.read(record)) for record in records]
+    scans = []
+    for index, (result, pose) in enumerate(zip(results, drive_poses(SCANS), strict=True)):
+        xyz = result.require_origin().scan.points[:, :3]
+        scans.append(DriveScan(index, xyz, result.scores, pose))
+
+    counts: Counter[str] = Counter()
+    for index, scores, sights in Consensus().stream(scans):
+        taught = np.load(world / f"run/{TEACHER}/{index:06d}.npy")
+        teaches = (scores.max(axis=1) > 0.07) & (sights >= LEAST_SIGHTS)
+        np.testing.assert_array_equal(taught, np.where(teaches, scores.argmax(axis=1) + 1, 0))
+        counts.update(map(str, teaches.tolist()))
+    assert set(counts) == {"True", "False"}
+    assert LEAST_PROBABILITY == 0.6
+
+
+def test_a_finished_run_is_resumed_and_another_one_refused(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(world / "run", out)
+    assert "--resume" in refusal(command(world, out))
+
+    monkeypatch.setattr(Figures, "is_better_than", lambda self, other: True)
+    succeed(command(world, out, "--resume"))
+    assert load(out).digests() == load(world / "run").digests()
+    assert "both networks agree on" in capsys.readouterr().out
+
+    save(fresh_weights(seed=1), tmp_path / "other.safetensors")
+    words = f"--weights {tmp_path}/other.safetensors --out {out} --streets 0 --epochs 1 --resume"
+    assert "weights of the earlier run" in refusal(f"adapt {world}/data {words}")
+
+
+def test_weights_that_are_no_surer_stay_as_they_were(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(world / "run", out)
+    monkeypatch.setattr(Figures, "is_better_than", lambda self, other: False)
+    succeed(command(world, out, "--resume"))
+    assert load(out).digests() == load(world / "w.safetensors").digests()
+    assert "the weights stay as they were" in capsys.readouterr().out
+
+
+def test_the_figures_of_labels_tell_which_are_surer() -> None:
+    before = Figures(uncertain=0.2, agreement=0.8, consistency=0.9)
+    assert Figures(0.1, 0.9, 0.8).is_better_than(before)
+    assert not Figures(0.1, 0.7, 0.9).is_better_than(before)
+    assert not Figures(0.3, 0.9, 0.9).is_better_than(before)
+
+
+def test_adapted_weights_expect_the_scans_of_the_weights_that_taught(world: Path) -> None:
+    """They label the drive as it was normalised for the training."""
+    before = load(world / "w.safetensors").training["range_net"]
+    after = load(world / "run").training["range_net"]
+    for key in ("sensor", "intensity_quantiles", "matched_intensity", "optional_intensity"):
+        assert after.get(key) == before.get(key)
+
+
+def test_streets_need_a_sensor_that_can_be_simulated(world: Path, tmp_path: Path) -> None:
+    line = command(world, tmp_path / "run").replace("--streets 0", "--streets 0.5")
+    assert "--streets 0" in refusal(line)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.full
+def test_loose_scans_teach_by_their_own_labels(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adapting, "LEAST_PROBABILITY", 0.07)
+    scan = world / "data/sequences/00/velodyne/000000.bin"
+    words = f"--weights {world}/w.safetensors --streets 0 --epochs 1"
+    assert "single scan" in refusal(f"adapt {scan} {words} --out {tmp_path}/a")
+    code, _ = run_cli(*f"adapt {scan} {words} --loose --out {tmp_path}/b".split())
+    assert code == 0
