@@ -29,6 +29,7 @@ OTHERS: dict[str, Any] = {
     "kind": "ply",
     "scores": True,
     "uncertain": True,
+    "drive": "0123456789abcdef",
 }
 
 
