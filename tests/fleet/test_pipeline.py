@@ -218,7 +218,7 @@ def test_a_signal_ends_the_run_and_its_workers_with_one_line(
     deadline = time.monotonic() + PATIENCE  # comes only if workers outlive the run
     while any(Path(f"/proc/{worker}").exists() for worker in workers):
         assert time.monotonic() < deadline, "workers outlive the run"
-        time.sleep(0.5)
+        time.sleep(0.5)  # between two looks
 
 
 def start(words: list[str]) -> subprocess.Popen[bytes]:
@@ -229,7 +229,7 @@ def wait_for(is_reached: Callable[[], bool], process: subprocess.Popen[Any]) -> 
     """Wait until a run has come so far, which it does before it is over, as labels are held."""
     while not is_reached():
         assert process.poll() is None, "the run was over before it was killed"
-        time.sleep(0.2)
+        time.sleep(0.2)  # between two looks
 
 
 def workers_of(driver: int) -> list[int]:
