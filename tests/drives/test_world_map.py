@@ -136,6 +136,7 @@ def test_the_viewer_and_the_readers_take_a_map(world: Path, tmp_path: Path) -> N
     assert len(amvnet.read(tmp_path / "map.ply")) == len(vertices)
 
 
+@pytest.mark.full
 def test_a_map_replaces_maps_only(world: Path, tmp_path: Path) -> None:
     out = tmp_path / "map.ply"
     out.write_text("ply\nmy own points")

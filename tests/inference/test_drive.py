@@ -94,6 +94,7 @@ def test_an_interrupted_run_resumes_to_the_same_labels(
     assert labels_in(tmp_path) == labels_in(world / "labels")
 
 
+@pytest.mark.full
 def test_a_run_is_not_resumed_with_other_poses(world: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "poses.npy", POSES)
     out = tmp_path / "out"
@@ -162,6 +163,7 @@ def test_a_drive_needs_scans_of_one_recording_in_a_row(world: Path, tmp_path: Pa
     assert "2 recordings" in line
 
 
+@pytest.mark.full
 def test_a_broken_scan_is_left_out_of_its_drive(world: Path, tmp_path: Path) -> None:
     write_drive(tmp_path / "data")
     path = tmp_path / "data/sequences/00/velodyne/000003.bin"

@@ -23,7 +23,7 @@ from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_n
 from amvnet.weights.file import Weights, load
 
 from fixtures.commands import files, run_cli
-from fixtures.marks import with_full, with_quick
+from fixtures.marks import with_full
 from fixtures.processes import Printed, become_cli, fork_server, start_cli
 from fixtures.tiny import write_recipe
 
@@ -146,12 +146,10 @@ def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
     return arguments
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("stage", "launcher"),
-    with_quick(
-        [("rv", "launch"), ("bev", "torchrun"), ("head", "srun"), ("rv", "srun")],
-        [("head", "srun")],
-    ),
+    [("rv", "launch"), ("bev", "torchrun"), ("head", "srun"), ("rv", "srun")],
 )
 def test_two_processes_train_the_weights_of_one(
     world: Path, tmp_path: Path, stage: str, launcher: str

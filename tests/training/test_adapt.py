@@ -91,6 +91,7 @@ def test_a_finished_run_is_resumed_and_another_one_refused(
     assert "weights of the earlier run" in refusal(f"adapt {world}/data {words}")
 
 
+@pytest.mark.full
 def test_weights_that_are_no_surer_stay_as_they_were(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

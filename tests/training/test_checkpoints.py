@@ -84,6 +84,7 @@ def test_a_run_that_cannot_begin_leaves_no_folder(world: Path, tmp_path: Path) -
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.full
 def test_resume_removes_what_killed_runs_have_left_half_written(
     world: Path, tmp_path: Path
 ) -> None:

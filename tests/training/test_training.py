@@ -279,6 +279,7 @@ def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: 
             train(world, out, *options)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("stage", "epoch"),
     [
@@ -411,6 +412,7 @@ def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
     assert record["data"] == f"simulated-hdl64e:{tmp_path / 'other'}"
 
 
+@pytest.mark.full
 def test_tuning_weights_of_matched_intensities_matches_the_other_scans_too(
     world: Path, run: Path, tmp_path: Path
 ) -> None:
@@ -477,6 +479,7 @@ def test_a_run_is_not_resumed_with_other_values(
     assert {name: (run / name).read_bytes() for name in names} == before
 
 
+@pytest.mark.full
 def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
     train_interrupted("rv", 2, world, tmp_path, "--stage", "rv")
     checkpoint = tmp_path / "rv/last.ckpt"
@@ -519,6 +522,7 @@ def test_an_existing_run_is_not_overwritten_without_resume(world: Path, run: Pat
     assert [path.read_bytes() for path in paths] == before
 
 
+@pytest.mark.full
 def test_a_finished_stage_without_its_checkpoint_is_not_trained_again(
     world: Path, run: Path, tmp_path: Path
 ) -> None:
