@@ -213,7 +213,6 @@ def labels_by_method(
 
     AMVNet and the ensembles include all ensembles and each single network. Other `methods` are left
     out. The networks run only once.
-
     """
     batch = segmenter.batch([scan])
     scores = segmenter.engine.score(batch)

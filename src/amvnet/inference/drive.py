@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -70,17 +70,16 @@ class Drives:
         """Return a new consensus for the scans of one drive."""
         return Consensus(past_only=self.past_only)
 
-    def in_reach(
-        self, scans: Sequence[InputScan], chosen: Collection[InputScan]
-    ) -> list[InputScan]:
+    def in_reach(self, scans: Sequence[InputScan], chosen: Sequence[InputScan]) -> list[InputScan]:
         """Return the chosen scans and all scans on which their labels depend, in order."""
         consensus = self.consensus()
+        keys = set(map(key_of, chosen))
         needed: list[InputScan] = []
         for _, drive in groupby(scans, key=lambda scan: scan.source):
             members = list(drive)
             is_needed = np.zeros(len(members), bool)
             for index, scan in enumerate(members):
-                if scan in chosen:
+                if key_of(scan) in keys:
                     first = max(index - consensus.reach, 0)
                     is_needed[first : index + consensus.ahead + 1] = True
             needed += [scan for scan, is_in in zip(members, is_needed, strict=True) if is_in]

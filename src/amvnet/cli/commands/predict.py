@@ -69,7 +69,7 @@ def predict(
             batch=batch,
             overwrite=overwrite,
             resume=resume,
-            also_read=(*inputs, weights, labels.classes, sensor_choice.sensor),
+            also_read=(*inputs, weights, labels.classes, sensor_choice.sensor, time.poses),
             progress=step,
             report=report,
         )
