@@ -252,6 +252,7 @@ def find_poses(
             poses = members[0].dataset.poses(records)
         where = "the file" if path is not None else "the dataset"
         if poses is None:
+            report(f"{name}: estimating the poses of {counted(len(members), 'scan')}")
             poses = _estimated(members, progress)
             where = "KISS-ICP"
 
