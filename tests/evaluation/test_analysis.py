@@ -210,6 +210,7 @@ def test_every_method_is_scored_as_by_the_segmenter(
 # ---- the command `analyze`
 
 
+@pytest.mark.full
 def test_analyze_writes_each_figure_as_picture_and_table(world: Path, tmp_path: Path) -> None:
     out = tmp_path
     succeed(f"analyze {world}/data --weights {world}/w.safetensors --out {out}")

@@ -285,6 +285,7 @@ def test_wrong_options_of_fuse_are_one_line(world: Path, tmp_path: Path) -> None
     assert not files(tmp_path)
 
 
+@pytest.mark.full
 def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) -> None:
     arguments = ("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path)
     first = ("--scores-a", world / "predictions")
@@ -342,6 +343,7 @@ def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(
     assert from_files.metrics["point_head"]["val/uncertain"] == pytest.approx(expected, abs=0.005)
 
 
+@pytest.mark.full
 def test_the_weights_hold_only_the_head_and_fuse_takes_them(
     world: Path, head: Path, tmp_path: Path
 ) -> None:
@@ -363,6 +365,7 @@ def test_the_weights_hold_only_the_head_and_fuse_takes_them(
     assert "range_net" in error
 
 
+@pytest.mark.full
 def test_the_run_resumes_with_its_own_scores_only(world: Path, head: Path) -> None:
     arguments = [*train_head_arguments(world, head), "--resume"]
     assert run_cli(*arguments, *score_options(world)) == (0, "")

@@ -43,6 +43,7 @@ def trained_at(height: float, root: Path) -> Weights:
     return replace(weights, sensor="hdl64e", training=training)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "height",
     [0.8, pytest.param(1.73, marks=pytest.mark.full), pytest.param(2.6, marks=pytest.mark.full)],

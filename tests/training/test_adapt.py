@@ -74,6 +74,7 @@ def test_points_teach_that_are_sure_and_seen_by_several_scans(world: Path) -> No
     assert LEAST_PROBABILITY == 0.6
 
 
+@pytest.mark.full
 def test_a_finished_run_is_resumed_and_another_one_refused(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -241,6 +241,7 @@ def test_a_mixed_scan_has_one_sector_of_another_scan(random_scan: RandomScan) ->
     assert 0.6 < max(shares) < 0.8
 
 
+@pytest.mark.full
 def test_a_scan_of_mixed_lasers_has_bands_of_elevation_of_both(random_scan: RandomScan) -> None:
     scan = random_scan(2000, 1)
     other = random_scan(1500, 2)
@@ -426,6 +427,7 @@ def test_whole_lasers_are_dropped_every_second_or_at_random(random_scan: RandomS
     assert 0.3 < max(shares) < 0.9
 
 
+@pytest.mark.full
 def test_dropped_blocks_are_rectangles_of_azimuth_and_elevation(random_scan: RandomScan) -> None:
     scan = random_scan(4000)
     index_of = index_by_point(scan)

@@ -53,6 +53,7 @@ def test_a_checkpoint_is_replaced_only_by_a_whole_one(
     assert os.listdir(tmp_path) == ["last.ckpt"]
 
 
+@pytest.mark.full
 def test_a_training_writes_nothing_into_the_temporary_folder_of_the_system(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,7 +60,7 @@ def trained_before(weights: Weights, no_intensity: float, is_matched: bool) -> W
     return replace(weights, training={"range_net": record, "polar_net": record})
 
 
-@pytest.mark.parametrize("hides", [0.0, 0.3])
+@pytest.mark.parametrize("hides", [pytest.param(0.0, marks=pytest.mark.full), 0.3])
 @pytest.mark.parametrize(
     ("begin", "stages"),
     [

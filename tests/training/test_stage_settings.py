@@ -43,8 +43,8 @@ def arguments(world: Path, out: Path, stage: str, *options: object) -> list[obje
     return ["train", world / "recipe.yaml", *shared, *options]
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("name", ["rv", "bev"])
+@pytest.mark.parametrize("weighted", [pytest.param(False, marks=pytest.mark.full), True])
+@pytest.mark.parametrize("name", ["rv", pytest.param("bev", marks=pytest.mark.full)])
 def test_a_stage_has_the_class_weights_of_its_scans_if_the_recipe_says_so(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, weighted: bool
 ) -> None:

@@ -507,6 +507,7 @@ def count_by_class(ids: np.ndarray, hidden: Sequence[int] = ()) -> list[int]:
     return list(counts.tolist())
 
 
+@pytest.mark.full
 def test_the_browser_hides_classes(path: Path, browser: Browser) -> None:
     _, planes = read_page(path).scan(0)
     hidden = np.unique(planes["rv"])[:2].tolist()
