@@ -758,9 +758,12 @@ def test_a_run_of_several_calls_records_what_each_trained_on(world: Path, tmp_pa
 def train_until_signal(words: list[str], printed: Printed, number: int) -> None:
     """Train in this process, which gets a signal at the beginning of the second epoch."""
 
-    def signalled(self: SeedBatches, trainer: Any, *_: object) -> None:
+    seed = SeedBatches.on_train_batch_start
+
+    def signalled(self: SeedBatches, trainer: Any, *arguments: Any) -> None:
         if trainer.current_epoch == 1:
             os.kill(os.getpid(), number)
+        seed(self, trainer, *arguments)
 
     SeedBatches.on_train_batch_start = signalled  # type: ignore[assignment, method-assign]
     become_cli(words, printed)
