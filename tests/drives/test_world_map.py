@@ -149,6 +149,26 @@ def test_a_map_replaces_maps_only(world: Path, tmp_path: Path) -> None:
     assert run_cli(*command(world, tmp_path / "other.ply", "--overwrite").split())[0] == 0
 
 
+def test_a_map_replaces_no_scan_and_no_other_cloud(world: Path, tmp_path: Path) -> None:
+    """Scans and the clouds of other programs have the ending of a map."""
+    laspy = pytest.importorskip("laspy")
+    out = tmp_path / "other.laz"
+    laspy.LasData(laspy.LasHeader(point_format=0)).write(out)
+    content = out.read_bytes()
+    assert "a map in LAZ" in refusal(command(world, out, "--overwrite"))
+    assert out.read_bytes() == content
+
+    drive = tmp_path / "drive"
+    for name in ("a.laz", "b.laz"):
+        succeed(command(world, drive / name))
+    scan = (drive / "a.laz").read_bytes()
+    words = f"--weights {world}/w.safetensors --out {drive}/a.laz --overwrite"
+    assert "an input" in refusal(f"map {drive} {words}")
+    assert (drive / "a.laz").read_bytes() == scan
+    succeed(command(world, tmp_path / "map.laz"))
+    succeed(command(world, tmp_path / "map.laz", "--overwrite"))
+
+
 def test_a_map_is_of_one_drive(world: Path, tmp_path: Path) -> None:
     for sequence in ("01", "02"):
         write_drive(tmp_path / "data", sequence, 3)

@@ -28,11 +28,14 @@ _PLY = (
     rb"ply\nformat binary_little_endian 1\.0\nelement vertex \d+\n"
     rb"property double x\nproperty double y\nproperty double z\n.*property ushort sights\n"
 )
+# The program that wrote a LAS file stands at byte 58 of it.
+PROGRAM = "amvnet map"
+_LAS = rb"LASF.{54}" + PROGRAM.encode()
 # The files of a map, by their ending.
 SIGNATURES = {
     ".ply": Signature("a map", _PLY),
-    ".las": Signature("a map in LAS", b"LASF"),
-    ".laz": Signature("a map in LAZ", b"LASF"),
+    ".las": Signature("a map in LAS", _LAS),
+    ".laz": Signature("a map in LAZ", _LAS),
 }
 FIGURES = Signature("figures of map", rb'\{\s*"scans": ')
 
@@ -87,6 +90,7 @@ class WorldMap:
         import laspy
 
         header = laspy.LasHeader(point_format=LAS_FORMAT, version="1.4")
+        header.generating_software = PROGRAM
         header.add_extra_dims(
             [laspy.ExtraBytesParams("confidence", "f4"), laspy.ExtraBytesParams("sights", "u2")]
         )

@@ -18,8 +18,7 @@ from amvnet.data.spacing import evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit
 from amvnet.errors import InputError
-from amvnet.inference.listing import DatasetScan, InputScan, LoadedScan
-from amvnet.inference.pipeline import Outcome
+from amvnet.inference.listing import DatasetScan, InputScan, LoadedScan, Outcome
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing

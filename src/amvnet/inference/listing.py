@@ -233,6 +233,8 @@ class FileScan:
 
 
 InputScan = DatasetScan | FileScan
+# A scan that was read and segmented, or the error that prevented it.
+Outcome = tuple[InputScan, LoadedScan | None, Segmentation | InputError]
 
 
 def list_inputs(

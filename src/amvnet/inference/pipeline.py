@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,17 +27,15 @@ from amvnet.data.labels.writers import (
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken, memory_for
 from amvnet.files import atomic_write, inside
+from amvnet.inference.drive import Drives
 from amvnet.inference.journal import UNFINISHED, Entry, Journal, read_journals
-from amvnet.inference.listing import InputScan, LoadedScan
+from amvnet.inference.listing import InputScan, LoadedScan, Outcome
 from amvnet.inference.scan_stream import READ_AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
 from amvnet.outputs import Signature, check_not_read, check_outputs
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED_SCANS
-
-if TYPE_CHECKING:
-    from amvnet.inference.drive import Drives
 
 UNCERTAIN_ENDING = ".uncertain.npy"
 DIGEST_LENGTH = 16  # the hexadecimal digits of a digest in the journal
@@ -89,8 +87,6 @@ class OutputOptions:
 # A function that segments scans in memory, given the inputs that they were read from. It raises
 # InputError if a scan is broken.
 Segment = Callable[[Sequence[InputScan], Sequence[Scan]], list[Segmentation]]
-# A scan that was read and segmented, or the error that prevented it.
-Outcome = tuple[InputScan, LoadedScan | None, Segmentation | InputError]
 Written = TypeVar("Written")
 
 

@@ -59,10 +59,11 @@ def map(
     outputs = {out: SIGNATURES[out.suffix]}
     if json is not None:
         outputs[json] = FIGURES
-    check_outputs(outputs, [inputs, weights, poses], overwrite)
     loaded = load(weights)
     normaliser = normaliser_for(loaded, sensor_choice.parse(), report)
     scans, _ = list_inputs([inputs], choice.parse(), loaded.taxonomy, normaliser)
+    files = [path for scan in scans for path in scan.files]
+    check_outputs(outputs, [*files, weights, poses], overwrite)
     with progress("poses") as step:
         drives = find_poses(scans, poses, progress=step, report=report, is_one=True)
     make_folder(out.parent)
