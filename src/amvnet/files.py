@@ -128,7 +128,8 @@ def publish(part: Path, path: Path) -> None:
 def alone_in(folder: Path, lock: str = ".lock") -> Iterator[None]:
     """Keep other runs out of an output folder during the block. The folder is made if necessary.
 
-    The lock ends with the process, however it ends.
+    The lock ends with the process, however it ends. A folder that was made is removed if the block
+    leaves it empty.
 
     Args:
         folder: the output folder.
@@ -137,6 +138,7 @@ def alone_in(folder: Path, lock: str = ".lock") -> Iterator[None]:
     Raises:
         InputError: if another run has the lock, or the folder cannot be written to.
     """
+    is_new = not folder.exists()
     make_folder(folder)
     path = folder / lock
     file = _open_locked(path)
@@ -145,6 +147,9 @@ def alone_in(folder: Path, lock: str = ".lock") -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         file.close()
+        if is_new:
+            with suppress(OSError):  # the folder is empty only if an error was found
+                folder.rmdir()
 
 
 def _open_locked(path: Path) -> IO[str]:
@@ -177,10 +182,12 @@ def _open_locked(path: Path) -> IO[str]:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the files that killed runs have not finished in a folder and in folders inside it."""
+    """Remove what killed runs have not finished: files, also in folders inside, and folders."""
     for path in folder.rglob(UNFINISHED_FILES):
         if path.is_file():
             path.unlink(missing_ok=True)
+    for path in folder.glob(UNFINISHED_FILES):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def inside(folder: Path | str, name: Path | str) -> Path:

@@ -92,6 +92,21 @@ def test_a_finished_run_is_resumed_and_another_one_refused(
     assert "weights of the earlier run" in refusal(f"adapt {world}/data {words}")
 
 
+def test_labels_that_are_all_unsure_teach_nothing(world: Path, tmp_path: Path) -> None:
+    """Fresh networks are never sure of a point."""
+    assert "probability over 0.6 in voxels" in refusal(command(world, tmp_path / "run"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_something_else_stays_as_it_was(world: Path, tmp_path: Path) -> None:
+    labels = tmp_path / "teacher/00/000000.npy"
+    labels.parent.mkdir(parents=True)
+    labels.write_text("mine")
+    assert "another run or teacher" in refusal(command(world, tmp_path))
+    assert labels.read_text() == "mine"
+    assert len(list(tmp_path.rglob("*"))) == 3
+
+
 @pytest.mark.full
 def test_weights_that_are_no_surer_stay_as_they_were(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

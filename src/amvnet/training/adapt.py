@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
@@ -16,7 +17,7 @@ from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR
 from amvnet.errors import InputError
-from amvnet.files import atomic_write, inside
+from amvnet.files import alone_in, atomic_write, inside, temporary_folder
 from amvnet.inference.drive import Drives
 from amvnet.inference.listing import InputScan
 from amvnet.inference.scan_stream import stream_scans
@@ -27,7 +28,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import network_records
 from amvnet.training.plan import Plan, sized_by_init
 from amvnet.training.run import train
-from amvnet.training.run_folder import check_folder
+from amvnet.training.run_folder import check_folder, is_run
 from amvnet.weights.file import Weights, load, save
 
 TEACHER = "teacher"  # the folder of the labels that teach, in the folder of the run
@@ -134,9 +135,10 @@ def teach(
         progress: called with the number of scans that are done, and their total.
 
     Raises:
-        InputError: if a scan cannot be read or segmented.
+        InputError: if a scan cannot be read or segmented, or no point teaches.
     """
     counts = np.zeros(4)  # of points, of uncertain ones, and of those that agree in two ways
+    taught = 0
     for scan, result, probabilities, sights in _fused(scans, drives, segmenter, progress):
         is_valid = result.labels > 0
         labels = np.where(probabilities.any(axis=1), probabilities.argmax(axis=1) + 1, 0)
@@ -151,8 +153,15 @@ def teach(
         if folder is not None:
             teaches = (probabilities.max(axis=1) > LEAST_PROBABILITY) & (sights >= LEAST_SIGHTS)
             ids = np.where(teaches, labels, 0).astype(np.uint8)
+            taught += np.count_nonzero(ids)
             with atomic_write(inside(folder, label_path(scan))) as part, part.open("wb") as file:
                 np.save(file, ids)
+    if folder is not None and not taught:
+        seen = "" if drives is None else f" in voxels that {LEAST_SIGHTS} scans see"
+        raise InputError(
+            f"expected points whose class has a probability over {LEAST_PROBABILITY}{seen}, found "
+            "none; give more scans of the drive, or --weights that know such a sensor"
+        )
     return Figures(*(float(share) for share in counts[1:] / max(counts[0], 1)))
 
 
@@ -212,10 +221,16 @@ def adapt(
     before = _read_figures(folder, request, plan.resume)
     if before is None:
         check_folder(plan)
-        with progress("labelling") as step:
-            before = teach(scans, drives, make_segmenter(weights), folder, step)
-        with atomic_write(folder / FIGURES) as part:
-            part.write_text(json.dumps({"request": request, **asdict(before)}))
+        if is_run(plan.out) or os.path.lexists(folder):
+            raise InputError(
+                f"{plan.out}: expected a new folder or the folder of an earlier adapt, found "
+                f"another run or {TEACHER}; give another folder"
+            )
+        with alone_in(plan.out, f".{TEACHER}.lock"), temporary_folder(plan.out) as part:
+            with progress("labelling") as step:
+                before = teach(scans, drives, make_segmenter(weights), part, step)
+            (part / FIGURES).write_text(json.dumps({"request": request, **asdict(before)}))
+            part.rename(folder)
     report(f"before: {before}")
 
     path = train(make_plan(TaughtScans(scans, folder, weights)), "all", weights)

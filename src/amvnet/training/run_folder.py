@@ -6,7 +6,7 @@ import hashlib
 import os
 import platform
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -94,17 +94,11 @@ def alone_in_run(plan: Plan, stage: str) -> Iterator[None]:
         yield
         return
 
-    is_new = not plan.out.exists()
-    try:
-        with ExitStack() as locks:
-            for name in PART_OF if stage == "all" else (stage,):
-                locks.enter_context(alone_in(plan.out, f".{name}.lock"))
-            remove_unfinished(plan.out if stage == "all" else plan.out / stage)
-            yield
-    finally:
-        if is_new:
-            with suppress(OSError):  # the folder is empty only if the check found an error
-                plan.out.rmdir()
+    with ExitStack() as locks:
+        for name in PART_OF if stage == "all" else (stage,):
+            locks.enter_context(alone_in(plan.out, f".{name}.lock"))
+        remove_unfinished(plan.out if stage == "all" else plan.out / stage)
+        yield
 
 
 def is_finished(plan: Plan, name: str) -> bool:
