@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -117,6 +118,27 @@ def test_weights_that_are_no_surer_stay_as_they_were(
     succeed(command(world, out, "--resume"))
     assert load(out).digests() == load(world / "w.safetensors").digests()
     assert "the weights stay as they were" in capsys.readouterr().out
+
+
+@pytest.mark.full
+def test_labelled_scans_decide_which_weights_stay(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_drive(tmp_path / "labelled", scans=1)
+    shutil.copytree(world / "run", tmp_path / "run")
+    val = f"--resume --val {tmp_path}/labelled"
+    scores: list[float] = []
+    for weights in (world / "w.safetensors", tmp_path / "run"):
+        words = f"{tmp_path}/labelled --weights {weights} --split all --methods amvnet --json"
+        succeed(f"evaluate {words} {tmp_path}/{len(scores)}.json")
+        figures = json.loads((tmp_path / f"{len(scores)}.json").read_text())
+        scores.append(figures["methods"]["amvnet"]["miou"])
+
+    succeed(command(world, tmp_path / "run", val))
+    printed = f"mIoU of the labelled scans: {scores[0]:.1%} before, {scores[1]:.1%} after"
+    assert printed in capsys.readouterr().out
+    kept = world / ("run" if scores[1] > scores[0] else "w.safetensors")
+    assert load(tmp_path / "run").digests() == load(kept).digests()
 
 
 def test_the_figures_of_labels_tell_which_are_surer() -> None:

@@ -29,8 +29,8 @@ from amvnet.files import temporary_folder
 from amvnet.fleet.manifest import check_outside, split_name
 from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, results_schema
 from amvnet.fleet.storage import Place
-from amvnet.inference.listing import FileReader, FileScan
-from amvnet.inference.pipeline import Outcome, Pipeline
+from amvnet.inference.listing import FileReader, FileScan, Outcome
+from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.request import LabellingRequest

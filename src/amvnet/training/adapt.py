@@ -153,7 +153,7 @@ def teach(
         if folder is not None:
             teaches = (probabilities.max(axis=1) > LEAST_PROBABILITY) & (sights >= LEAST_SIGHTS)
             ids = np.where(teaches, labels, 0).astype(np.uint8)
-            taught += np.count_nonzero(ids)
+            taught += int(np.count_nonzero(ids))
             with atomic_write(inside(folder, label_path(scan))) as part, part.open("wb") as file:
                 np.save(file, ids)
     if folder is not None and not taught:
@@ -194,6 +194,7 @@ def adapt(
     weights: Weights,
     make_segmenter: Callable[[Weights], Segmenter],
     make_plan: Callable[[Dataset], Plan],
+    score: Callable[[Segmenter], float] | None = None,
     *,
     progress: Callable[[str], AbstractContextManager[Progress]],
     report: Reporter = report_nothing,
@@ -206,6 +207,8 @@ def adapt(
         weights: the weights that teach, and that the training begins with.
         make_segmenter: returns the segmenter of some weights.
         make_plan: returns the plan of the training, given the scans with their labels.
+        score: returns the mIoU of a segmenter on labelled scans, which decides whether the trained
+            weights are better; by default, figures without labels do.
         progress: returns a context that shows the progress of a step with a name.
         report: takes a line about what happens.
 
@@ -237,9 +240,14 @@ def adapt(
     with progress("comparing") as step:
         after = teach(scans, drives, make_segmenter(load(path)), progress=step)
     report(f"after: {after}")
-    if not after.is_better_than(before):
+    is_better = after.is_better_than(before)
+    if score is not None:
+        old, new = (score(make_segmenter(chosen)) for chosen in (weights, load(path)))
+        report(f"mIoU of the labelled scans: {old:.1%} before, {new:.1%} after")
+        is_better = new > old
+    if not is_better:
         save(weights, path)
-        report("the labels are not surer than before, so the weights stay as they were")
+        report("the labels are no better than before, so the weights stay as they were")
     return path
 
 

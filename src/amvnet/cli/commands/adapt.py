@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import on_terminal, progress, report
-from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
+from amvnet.cli.options import LabelledChoice, ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Count, Share
 from amvnet.models.methods import Compute
 
@@ -30,6 +31,8 @@ def adapt(
     epochs: Count | None = None,
     streets: Share = 0.5,
     seed: Count | None = None,
+    val: str | None = None,
+    val_sequences: tuple[str, ...] | None = None,
     resume: bool = False,
 ) -> None:
     """Teach weights by an unlabelled drive: by the consensus of their own labels over time.
@@ -49,6 +52,9 @@ def adapt(
         streets: share of simulated streets in an epoch, which keep the networks from forgetting
             classes that the drive lacks; 0 for none.
         seed: the seed of the training; default: 0.
+        val: a dataset with labels, which score the weights before and after, and so decide which
+            are kept; default: figures that need no labels decide.
+        val_sequences: sequences or scenes of --val, separated by commas; default: all with labels.
         resume: continue an earlier run in the folder.
     """
     from amvnet.data.datasets.joined import join
@@ -87,10 +93,32 @@ def adapt(
             resume=resume,
             report=report,
             bars=on_terminal(),
-            also_read=(*inputs, weights, poses),
+            also_read=(*inputs, weights, poses, val),
         )
 
+    score = None if val is None else _score_on(val, val_sequences, loaded)
     path = adapt_weights(
-        scans, drives, loaded, make_segmenter, make_plan, progress=progress, report=report
+        scans, drives, loaded, make_segmenter, make_plan, score, progress=progress, report=report
     )
     report(f"weights in {path}")
+
+
+def _score_on(
+    val: str, sequences: tuple[str, ...] | None, weights: Weights
+) -> Callable[[Segmenter], float]:
+    """Return a function that returns the mIoU of a segmenter on labelled scans."""
+    from amvnet.data.datasets.open import open_dataset
+    from amvnet.evaluation.scoring import evaluate, label_by_weights
+    from amvnet.inference.reading import normalised, normaliser_for
+
+    dataset = normalised(open_dataset(val, weights.taxonomy), normaliser_for(weights))
+    records = LabelledChoice("all", sequences).records(dataset)
+
+    def score(segmenter: Segmenter) -> float:
+        labeller = label_by_weights(dataset, segmenter, ["amvnet"])
+        with progress("scoring") as step:
+            evaluation = evaluate(dataset, records, labeller, progress=step)
+        miou: float = evaluation.report(val)["methods"]["amvnet"]["miou"]
+        return miou
+
+    return score
