@@ -14,10 +14,12 @@ import amvnet
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.drives.consensus import LEAST
 from amvnet.drives.world_map import MapBuilder
+from amvnet.errors import InputError
+from amvnet.inference import map as mapping
 from amvnet.weights.file import save
 
 from fixtures.commands import refusal, run_cli, succeed
-from fixtures.drives import drive_poses, write_drive
+from fixtures.drives import SCANS, drive_poses, write_drive
 from fixtures.tiny import fresh_weights
 
 ROAD = 9  # train ids of SemanticKITTI
@@ -167,6 +169,32 @@ def test_a_map_replaces_no_scan_and_no_other_cloud(world: Path, tmp_path: Path) 
     assert (drive / "a.laz").read_bytes() == scan
     succeed(command(world, tmp_path / "map.laz"))
     succeed(command(world, tmp_path / "map.laz", "--overwrite"))
+
+
+def test_a_map_that_was_stopped_is_resumed_to_the_same_map(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    succeed(command(world, tmp_path / "whole.ply"))
+    monkeypatch.setattr(mapping, "SAVED_SCANS", 2)
+    added = 0
+    add = MapBuilder.add
+
+    def stop_at_the_fourth(*args: object) -> None:
+        nonlocal added
+        added += 1
+        if added == 4:
+            raise InputError("stopped")
+        add(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(MapBuilder, "add", stop_at_the_fourth)
+    out = tmp_path / "map.ply"
+    assert run_cli(*command(world, out).split())[0] != 0
+    assert not out.exists()
+    assert "another one" in refusal(command(world, out, "--resume --voxel 0.7"))
+    succeed(command(world, out, "--resume"))
+    assert added == 4 + SCANS - 2
+    assert out.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.ply", "whole.ply"]
 
 
 def test_a_map_is_of_one_drive(world: Path, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from amvnet.runtime.threads import wait_passively
 _FIRST = (demo, simulate, check, train, adapt, predict, fleet, evaluate, map_drive, submit, fuse)
 _LAST = (rank, analyze, ablate, export, view, bench, list_names, info)
 COMMANDS = {function.__name__: function for function in _FIRST + _LAST}
-WITH_RESUME = ("train", "adapt", "predict", "fleet")  # commands that have --resume
+WITH_RESUME = ("train", "adapt", "map", "predict", "fleet")  # commands that have --resume
 CONTINUED_WHEN_REPEATED = (
     "simulate",
     "ablate",

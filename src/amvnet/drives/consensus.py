@@ -83,6 +83,14 @@ class VoxelTable:
         """Return all voxels: their keys (V,), sums (V, C) and numbers of scans (V,)."""
         return self._keys, self._sums[self._rows], self._scans[self._rows]
 
+    def restore(
+        self, keys: NDArray[np.int64], sums: NDArray[np.float32], scans: NDArray[np.int32]
+    ) -> None:
+        """Set all voxels, given what `contents` returned."""
+        self._keys, self._sums, self._scans = keys, sums, scans
+        self._rows = np.arange(len(keys))
+        self._free = np.empty(0, np.intp)
+
     def _take(self, count: int) -> NDArray[np.intp]:
         """Return rows of zeros that no voxel has."""
         size = len(self._sums)

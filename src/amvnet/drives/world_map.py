@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -137,6 +138,49 @@ class MapBuilder:
         keys, inverse = np.unique(keys_of(index), return_inverse=True)
         values = np.concatenate((weighted, within, np.ones((len(world), 1), np.float32)), axis=1)
         self._table.add(keys, sum_by(inverse, values, len(keys)))
+
+    def save(self, path: Path, request: str, done: int) -> None:
+        """Write the unfinished map, so that `restore` can continue it.
+
+        Args:
+            path: the file, which appears whole or not at all.
+            request: a text that tells this map from others.
+            done: the number of scans that were added.
+        """
+        keys, sums, scans = self._table.contents()
+        with atomic_write(path) as part, part.open("wb") as file:
+            np.savez(
+                file,
+                request=request,
+                done=done,
+                origin=np.zeros(3) if self._origin is None else self._origin,
+                keys=keys,
+                sums=sums,
+                scans=scans,
+            )
+
+    def restore(self, path: Path, request: str) -> int:
+        """Continue an unfinished map, and return the number of scans that were added to it.
+
+        Without a file that can be read, the map stays empty.
+
+        Raises:
+            InputError: if the file is of another map.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                state = dict(file)
+        except (OSError, ValueError, EOFError, BadZipFile):
+            return 0
+        if str(state.pop("request")) != request:
+            raise InputError(
+                f"{path}: expected an unfinished map of the same scans, poses, weights and "
+                "voxels, found another one; leave --resume out"
+            )
+        done = int(state.pop("done"))
+        self._origin = state.pop("origin")
+        self._table.restore(**state)
+        return done
 
     def build(self, keeps_movable: bool = False) -> WorldMap:
         """Return the map.

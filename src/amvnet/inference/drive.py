@@ -23,6 +23,7 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
 from amvnet.scan import AnyArray, Scan
+from amvnet.weights.file import Weights
 
 STANDING = -1.2  # height above which points of a normalised scan stand on the ground, metres
 FAR = 8.0  # distance up to which two scans are compared if they are not consecutive, metres
@@ -188,6 +189,13 @@ def with_scores(
 def key_of(scan: InputScan) -> tuple[str, str]:
     """Return the recording and the name of a scan, which belong to no other scan."""
     return scan.source, scan.name
+
+
+def digest_of(scans: Sequence[InputScan], drives: Drives | None, weights: Weights) -> str:
+    """Return a digest of all that the labels of some scans depend on."""
+    poses = None if drives is None else drives.digest
+    request = repr((list(map(key_of, scans)), poses, weights.digests()))
+    return hashlib.sha256(request.encode()).hexdigest()[:16]
 
 
 def points_of(loaded: LoadedScan, of_files: bool) -> np.ndarray:

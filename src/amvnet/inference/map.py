@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,23 +18,40 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, no_progress
 
+SAVED_SCANS = 50  # number of scans after which the unfinished map is saved again
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """Where an unfinished map is saved.
+
+    Attributes:
+        path: the file.
+        request: a text that tells the map from others.
+        resume: whether to continue the map that the file holds.
+    """
+
+    path: Path
+    request: str
+    resume: bool
+
 
 def map_drive(
     scans: Sequence[InputScan],
     drives: Drives,
     segmenter: Segmenter,
-    voxel: float,
-    keeps_movable: bool = False,
+    builder: MapBuilder,
+    saved: SavedMap | None = None,
     progress: Progress = no_progress,
-) -> WorldMap:
-    """Segment the scans of drives in one world, and collect what they say of each voxel.
+) -> None:
+    """Segment the scans of a drive, and add them to a map.
 
     Args:
         scans: the scans.
         drives: their poses.
         segmenter: segments each scan.
-        voxel: edge of the voxels, metres.
-        keeps_movable: whether voxels of vehicles, two-wheelers and people are kept.
+        builder: the map.
+        saved: where the unfinished map is saved; by default, it is not saved.
         progress: called with the number of scans that are done, and their total.
 
     Raises:
@@ -43,12 +62,16 @@ def map_drive(
         points = points_of(loaded, drives.of_files)
         return points, segmenter(loaded.scan), drives.poses[key_of(scan)]
 
-    builder = MapBuilder(voxel, segmenter.taxonomy)
+    done = 0
+    if saved is not None and saved.resume:
+        done = builder.restore(saved.path, saved.request)
     for points, result, pose in stream_scans(
-        scans, lambda scan: scan.load(), segment, segmenter.at_once, progress
+        scans[done:], lambda scan: scan.load(), segment, segmenter.at_once, progress
     ):
         builder.add(points, result.scores, pose)
-    return builder.build(keeps_movable)
+        done += 1
+        if saved is not None and done % SAVED_SCANS == 0:
+            builder.save(saved.path, saved.request, done)
 
 
 def describe_map(world: WorldMap, scans: int) -> dict[str, Any]:

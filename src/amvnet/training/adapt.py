@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, inside, temporary_folder
-from amvnet.inference.drive import Drives
+from amvnet.inference.drive import Drives, digest_of
 from amvnet.inference.listing import InputScan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
@@ -220,7 +219,7 @@ def adapt(
     """
     plan = make_plan(TaughtScans(scans, Path(), weights))
     folder = plan.out / TEACHER
-    request = _digest(scans, drives, weights)
+    request = digest_of(scans, drives, weights)
     before = _read_figures(folder, request, plan.resume)
     if before is None:
         check_folder(plan)
@@ -249,13 +248,6 @@ def adapt(
         save(weights, path)
         report("the labels are no better than before, so the weights stay as they were")
     return path
-
-
-def _digest(scans: Sequence[InputScan], drives: Drives | None, weights: Weights) -> str:
-    """Return a digest of all that the labels depend on."""
-    names = [(scan.source, scan.name) for scan in scans]
-    poses = None if drives is None else drives.digest
-    return hashlib.sha256(repr((names, poses, weights.digests())).encode()).hexdigest()[:16]
 
 
 def _read_figures(folder: Path, request: str, resume: bool) -> Figures | None:

@@ -27,6 +27,7 @@ def map(
     voxel: Annotated[float, Range(0.02, 10)] = 0.2,
     keep_movable: bool = False,
     json: Path | None = None,
+    resume: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Make one labelled cloud of the static world that a drive has seen.
@@ -44,13 +45,14 @@ def map(
         voxel: edge of the voxels, metres.
         keep_movable: keep voxels of vehicles, two-wheelers and people, which may have moved.
         json: file for the figures of the map: scans, metres, voxels by class.
+        resume: continue a map that was stopped.
         overwrite: replace files that exist.
     """
-    from amvnet.drives.world_map import FIGURES, SIGNATURES, check_ending
+    from amvnet.drives.world_map import FIGURES, SIGNATURES, MapBuilder, check_ending
     from amvnet.files import atomic_write, make_folder
-    from amvnet.inference.drive import find_poses
+    from amvnet.inference.drive import digest_of, find_poses
     from amvnet.inference.listing import list_inputs
-    from amvnet.inference.map import describe_map, map_drive
+    from amvnet.inference.map import SavedMap, describe_map, map_drive
     from amvnet.inference.reading import normaliser_for
     from amvnet.outputs import check_outputs
     from amvnet.weights.file import load
@@ -68,10 +70,15 @@ def map(
         drives = find_poses(scans, poses, progress=step, report=report, is_one=True)
     make_folder(out.parent)
 
+    request = f"{digest_of(scans, drives, loaded)}, {voxel:g} m"
+    saved = SavedMap(out.with_name(f".{out.name}.unfinished.npz"), request, resume)
+    builder = MapBuilder(voxel, loaded.taxonomy)
     segmenter = load_segmenter(loaded, "amvnet", compute)
     with progress("mapping") as step:
-        world = map_drive(scans, drives, segmenter, voxel, keep_movable, step)
+        map_drive(scans, drives, segmenter, builder, saved, step)
+    world = builder.build(keep_movable)
     world.write(out)
+    saved.path.unlink(missing_ok=True)
     figures = describe_map(world, len(scans))
     if json is not None:
         with atomic_write(json) as part:
