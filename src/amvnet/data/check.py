@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from amvnet.cache import PRIVATE_FILE, make_private, shared_with_others, user_cache
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 
 SHOWN_IDS = 5  # largest number of unknown ids that a message lists
-# Largest size of a file of `Memory` that is read, bytes. 20,000 scans need 5 million bytes.
-MAX_MEMORY_BYTES = 200_000_000
 
 
 @dataclass(frozen=True)
@@ -200,8 +192,7 @@ def check_scans(
 ) -> Report:
     """Read all labelled scans of some splits, and report what they hold.
 
-    Several threads read the scans. The user's cache remembers their raw ids until their files
-    change; other classes need no new reading.
+    Several threads read the scans.
 
     Args:
         dataset: the dataset.
@@ -245,21 +236,10 @@ def _find_contents(
     Args:
         records: labelled scans by name.
     """
-    memory = Memory(dataset)
-    # All processes take what the first one recalls: a later process might recall other scans,
-    # because the first one keeps new scans below.
-    known = processes.gather(memory.recall(list(records.values())))[0]
-    found: dict[str, Contents | str] = {**known}
-    unread = [record for name, record in records.items() if name not in known]
-    # Take the states before the scans are read. If a file changes during the reading, its contents
-    # are then remembered for the old state, and read again the next time.
-    states = {name: _state_of(record) for name, record in records.items()}
-    for part in processes.gather(_read_all(dataset, processes.share(unread), progress)):
+    found: dict[str, Contents | str] = {}
+    share = processes.share(list(records.values()))
+    for part in processes.gather(_read_all(dataset, share, progress)):
         found |= part
-
-    if unread and processes.first:
-        whole = {name: item for name, item in found.items() if isinstance(item, Contents)}
-        memory.keep(states, whole)
     return found
 
 
@@ -312,59 +292,3 @@ def _contents_of(dataset: Dataset, record: ScanRecord) -> Contents:
             "leave the scan out"
         )
     return Contents(valid, ids)
-
-
-class Memory:
-    """A memory in the user's cache of what the scans of a dataset hold, until their files change.
-
-    If the cache cannot be read or written, or if another user can write it, nothing is remembered,
-    which only costs time.
-    """
-
-    def __init__(self, dataset: Dataset) -> None:
-        identity = repr((type(dataset).__name__, dataset.reading_key()))
-        name = hashlib.sha256(identity.encode()).hexdigest()[:16]
-        self.path = user_cache() / "checked" / f"{name}.json"
-        self._entries: dict[str, Any] = {}
-
-    def recall(self, records: Sequence[ScanRecord]) -> dict[str, Contents]:
-        """Return the remembered contents of scans by name."""
-        entries: Any = None
-        with suppress(OSError, ValueError, RecursionError):
-            is_private = shared_with_others(self.path.parent) is None
-            if is_private and self.path.stat().st_size <= MAX_MEMORY_BYTES:
-                entries = json.loads(self.path.read_text(encoding="utf-8"))
-        self._entries = entries if isinstance(entries, dict) else {}
-
-        known = {}
-        for record in records:
-            with suppress(KeyError, TypeError, ValueError, AttributeError):
-                state, valid, ids = self._entries[record.name]
-                if state == _state_of(record):
-                    counts = {int(raw_id): int(count) for raw_id, count in ids.items()}
-                    known[record.name] = Contents(int(valid), counts)
-        return known
-
-    def keep(self, states: Mapping[str, list[list[Any]]], contents: Mapping[str, Contents]) -> None:
-        """Remember the contents of scans, in addition to what was recalled.
-
-        Args:
-            states: what `_state_of` returned before the scans were read, by name.
-            contents: what the scans hold, by name.
-        """
-        for name, found in contents.items():
-            self._entries[name] = (states[name], found.valid, found.ids)
-        with suppress(OSError, InputError):
-            make_private(self.path.parent)
-            with atomic_write(self.path) as part:
-                part.write_text(json.dumps(self._entries), encoding="utf-8")
-            self.path.chmod(PRIVATE_FILE)
-
-
-def _state_of(record: ScanRecord) -> list[list[Any]]:
-    """Return the path, size and time of each file of a scan; they change with the files."""
-    state: list[list[Any]] = []
-    for path in (record.points_path, record.labels_path):
-        stat = path.stat() if path is not None and path.is_file() else None
-        state.append([str(path), stat and stat.st_size, stat and stat.st_mtime_ns])
-    return state

@@ -194,10 +194,6 @@ class Dataset(ABC):
         """Return the int16 train ids by raw id (`raw_labels`), UNKNOWN for ids to refuse."""
         return self.taxonomy.train_ids_by_raw
 
-    def reading_key(self) -> str:
-        """Return a text that changes if the same files would be read in another way."""
-        return f"{self.spec} in {self.root.absolute()}"
-
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan; raise the errors of `read`."""
         return len(self.read(record, labels=False))

@@ -137,12 +137,6 @@ class OwnScans(Dataset):
         missing = self.taxonomy.train_to_raw[0]
         return read_raw_labels(record.labels_path, count, place.field, layout, missing=missing)
 
-    def reading_key(self) -> str:
-        """Return what the file says of how scans and labels are read."""
-        described = self.description
-        missing = described.taxonomy.train_to_raw[0]
-        return repr((self.root, described.scans, described.labels, described.layout, missing))
-
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan; the file is not read a second time."""
         if record.name not in self._counts:
