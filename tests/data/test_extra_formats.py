@@ -18,12 +18,9 @@ from amvnet.data.formats.detect import BAGS, GZIP, named_ending
 from amvnet.data.formats.find import list_scans, read_cloud, scan_stem
 from amvnet.data.formats.rows import parse_layout
 from amvnet.errors import InputError
-from amvnet.files import fault_of_name
-from amvnet.weights.file import save
 
-from fixtures.commands import fails, files, run_cli
+from fixtures.commands import fails
 from fixtures.scan_writers import WRITERS, some_points, write_sweep
-from fixtures.tiny import fresh_weights, street
 
 PACKETS = "uint8[] data\n"
 
@@ -101,14 +98,7 @@ def test_feather_without_its_package_names_the_extra(
     fails(lambda: read_cloud(path), path, 'pip install "amvnet[feather]"')
 
 
-# --- packed files and archives ---
-
-
-def zip_of(path: Path, members: dict[str, bytes]) -> Path:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    return path
+# --- packed files ---
 
 
 @pytest.fixture(scope="module")
@@ -143,25 +133,8 @@ def test_rows_may_be_packed(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cloud.xyz, some_points()[:, 2::-1])
 
 
-def test_the_scans_of_an_archive_are_named_by_their_folders(
-    tmp_path: Path, contents: dict[str, bytes]
-) -> None:
-    others = {"a/readme.txt": b"1 2 3\n", "__MACOSX/a/._kitti.bin": b"x", "b/": b"", ".x.bin": b""}
-    members = {f"a/{name}": content for name, content in contents.items()}
-    path = zip_of(tmp_path / "drive.zip", members | others)
-    scans = list(list_scans(path))
-    assert "drive/a/kitti" in {scan.name for scan in scans}
-    assert len(scans) == len(contents) - 1  # without the texts
-    for scan in scans:
-        np.testing.assert_allclose(scan.read().to_scan().points, some_points(), atol=1e-3)
-    assert {scan.source for scan in scans if scan.ending == ".pcd"} == {f"{path}/a/*.pcd"}
-    # One that is no archive of scans, by its name, is one of NumPy.
-    assert [scan.ending for scan in list_scans(tmp_path)] == [scan.ending for scan in scans]
-
-
 def test_a_broken_packed_file_is_one_line(tmp_path: Path, contents: dict[str, bytes]) -> None:
-    one = {"kitti.bin": contents["kitti.bin"]}
-    packed = gzip.compress(one["kitti.bin"])
+    packed = gzip.compress(contents["kitti.bin"])
     cases = {
         "empty": b"\x1f\x8b",
         "cut": packed[: len(packed) // 2],
@@ -170,7 +143,7 @@ def test_a_broken_packed_file_is_one_line(tmp_path: Path, contents: dict[str, by
         "packed twice": gzip.compress(packed),
         "followed by others": packed + b"more",
         "nothing": gzip.compress(b""),
-        "an archive": gzip.compress(zip_of(tmp_path / "x.zip", one).read_bytes()),
+        "an archive": gzip.compress(contents["archive.npz"][:40]),
     }
     for name, content in cases.items():
         path = tmp_path / f"{name}.bin.gz"
@@ -178,64 +151,10 @@ def test_a_broken_packed_file_is_one_line(tmp_path: Path, contents: dict[str, by
         fails(lambda path=path: read_cloud(path).to_scan(), path)  # type: ignore[misc]
 
 
-def test_nothing_leaves_an_archive(tmp_path: Path, contents: dict[str, bytes]) -> None:
-    """Names that lead elsewhere, and links, are broken scans; archives in archives are none."""
-    link = zipfile.ZipInfo("link.bin")
-    link.create_system = 3
-    link.external_attr = 0o120777 << 16
-    path = zip_of(tmp_path / "a.zip", {"good.bin": contents["kitti.bin"]})
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr(link, "/etc/passwd")
-        archive.writestr("../../up.bin", contents["kitti.bin"])
-        archive.writestr("inner.zip", zip_of(tmp_path / "i.zip", contents).read_bytes())
-        archive.writestr("inner.bin.gz", gzip.compress(contents["kitti.bin"]))
-        archive.writestr("/absolute.bin", contents["kitti.bin"])
-        archive.writestr("new\nline.bin", contents["kitti.bin"])
-        archive.writestr(f"{'long' * 70}.bin", contents["kitti.bin"])
-    before = set(tmp_path.rglob("*"))
-
-    scans = {scan.name: scan for scan in list_scans(path)}
-    refused = [name for name in scans if name.startswith("a/member-")]
-    assert len(refused) == 4
-    assert set(scans) == {"a/good", "a/link", *refused}
-    fails(scans["a/link"].read, f"{path} (link.bin)")
-    for name in refused:
-        fails(scans[name].read, str(path), "expected the name of a scan", "rename it")
-        assert fault_of_name(Path(name)) is None
-    assert len(scans["a/good"].read().xyz) == len(some_points())
-    assert set(tmp_path.rglob("*")) == before
-
-    zip_of(tmp_path / "none.zip", {"a.doc": b"1"})
-    zip_of(tmp_path / "nothing.zip", {})
-    for name in ("none.zip", "nothing.zip"):
-        fails(lambda name=name: list(list_scans(tmp_path / name)), name)  # type: ignore[misc]
-    whole = zip_of(tmp_path / "whole.zip", {"good.bin": contents["kitti.bin"]})
-    (tmp_path / "cut.zip").write_bytes(whole.read_bytes()[:-30])
-    fails(lambda: list(list_scans(tmp_path / "cut.zip")), "cut.zip")
-
-
-def test_an_archive_with_a_bad_name_is_segmented_but_for_this_scan(
-    tmp_path: Path, contents: dict[str, bytes]
-) -> None:
-    points, _ = street(3)
-    members = {"good.bin": points.tobytes(), "../up.bin": points.tobytes()}
-    path = zip_of(tmp_path / "a.zip", members)
-    weights = save(fresh_weights(), tmp_path / "w.safetensors")
-    code, error = run_cli("predict", path, "--weights", weights, "--out", tmp_path / "out")
-    assert code == 3
-    assert "up.bin" in error
-    assert [file.name for file in (tmp_path / "out").rglob("*.label")] == ["good.label"]
-    assert not (tmp_path / "up.label").exists()
-
-
-def test_an_archive_of_a_user_is_segmented(tmp_path: Path, contents: dict[str, bytes]) -> None:
-    points, _ = street(3)
-    points[:, 3] = points[:, 3].clip(0, 1)
-    zip_of(tmp_path / "drive.zip", {"a/0.bin": points.tobytes(), "a/1.bin": b"broken"})
-    save(fresh_weights(), tmp_path / "w.safetensors")
-    options = ("--weights", tmp_path / "w.safetensors", "--out", tmp_path / "out")
-    code, error = run_cli("predict", tmp_path / "drive.zip", *options)
-    assert code == 3
-    assert "drive.zip (a/1.bin)" in error
-    assert (tmp_path / "out/drive/a/0.label").stat().st_size == 4 * len(points)
-    assert files(tmp_path / "out") == {"drive/a/0.label"}
+def test_an_archive_of_scans_is_to_be_unzipped(tmp_path: Path, contents: dict[str, bytes]) -> None:
+    path = tmp_path / "drive.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("kitti.bin", contents["kitti.bin"])
+    fails(lambda: list(list_scans(path)), path, "unzip it")
+    (tmp_path / "kitti.bin").write_bytes(contents["kitti.bin"])
+    assert [scan.name for scan in list_scans(tmp_path)] == ["kitti"]

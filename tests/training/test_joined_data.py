@@ -418,15 +418,15 @@ def test_scans_of_the_test_split_are_not_mixed_in_either(tmp_path: Path) -> None
         join(split_records(first, None, None), [same])
 
 
-def test_scans_of_an_archive_are_told_apart_by_their_names_in_it(tmp_path: Path) -> None:
+def test_scans_of_a_bag_are_told_apart_by_their_names_in_it(tmp_path: Path) -> None:
     data = open_dataset(str(make_streets(tmp_path / "a", ("00", "01"), 1)))
     val, train = (
-        [replace(record, points_path=tmp_path / "d.zip", name=f"d/{folder}/000000")]
+        [replace(record, points_path=tmp_path / "d.mcap", name=f"d/{folder}/000000")]
         for folder, record in zip("ab", data.records(["00", "01"]), strict=True)
     )
     scans = TrainingScans(data, data.records(["00"]), val)
     assert join(scans, [TrainingScans(data, train, [])])
-    with pytest.raises(InputError, match=r"d\.zip among both"):
+    with pytest.raises(InputError, match=r"d\.mcap among both"):
         join(scans, [TrainingScans(data, val, [])])
 
 

@@ -172,7 +172,7 @@ def join(
 
 
 def _identity(record: ScanRecord) -> tuple[str, str]:
-    """Return what identifies a scan in any dataset: its file, and its name in an archive or bag."""
+    """Return what identifies a scan in any dataset: its file, and its name in a bag."""
     in_file = record.name.partition(f"{scan_stem(record.points_path)}/")[2]
     return os.path.realpath(record.points_path), in_file
 

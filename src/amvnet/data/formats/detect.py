@@ -12,7 +12,6 @@ from amvnet.errors import InputError
 TEXT = (".xyz", ".txt", ".csv", ".asc", ".pts")
 BAGS = (".bag", ".mcap", ".db3")
 FOLDER = ""  # the ending of a ROS 2 bag that is a folder
-ARCHIVE = ".zip"  # the ending of an archive of scan files
 GZIP = ".gz"  # follows the ending of a compressed scan file
 METADATA = "metadata.yaml"  # a file in the folder of every ROS 2 bag
 # The endings of all files that are read. docs/own_scans.md says what is read from each kind.
@@ -21,7 +20,6 @@ ENDINGS = (
     *TEXT,
     *(".las", ".laz", ".feather"),
     *BAGS,
-    ARCHIVE,
 )
 
 # The ending of a file by its first bytes.
@@ -65,9 +63,9 @@ def ending_of(path: Path) -> str:
     ending = _begins_as(head[:BEGINNING])
     named = named_ending(path)
     if ending is not None:
-        # Archives of NumPy begin like all archives; only the name tells them apart.
-        is_archive = ending == ".npz" and named == ARCHIVE
-        return ARCHIVE if is_archive else ending
+        if ending == ".npz" and path.suffix.lower() == ".zip":
+            raise InputError(f"{path}: expected a scan file, found an archive; unzip it")
+        return ending
 
     if find_table(head) is not None:
         return named if named in TEXT else TEXT[0]
@@ -99,7 +97,7 @@ def named_ending(path: Path) -> str | None:
     name = path.name.lower()
     if name.endswith(GZIP):
         packed = named_ending(Path(name.removesuffix(GZIP)))
-        return None if packed in (None, GZIP, ARCHIVE, *BAGS, *TEXT) else GZIP
+        return None if packed in (None, GZIP, *BAGS, *TEXT) else GZIP
     for ending in ENDINGS:
         if name.endswith(ending):
             return ending

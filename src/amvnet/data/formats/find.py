@@ -13,7 +13,6 @@ from pathlib import Path
 
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import (
-    ARCHIVE,
     BAGS,
     ENDINGS,
     FOLDER,
@@ -24,11 +23,10 @@ from amvnet.data.formats.detect import (
     is_dead_link,
     named_ending,
 )
-from amvnet.data.formats.registry import list_archive, open_bag, read_file, read_from_archive
+from amvnet.data.formats.registry import open_bag, read_file
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_comma_table, find_table, read_head
-from amvnet.errors import InputError, shown
-from amvnet.files import fault_of_name
+from amvnet.errors import InputError
 
 ANY_FOLDERS = "**"  # the part of a pattern that stands for any folders
 POSE_COLUMNS = 12  # the numbers in a line of KITTI's files of poses, a 3 x 4 matrix
@@ -136,8 +134,6 @@ def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
 def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> list[NamedScan]:
     """Return the scans of a file or a bag."""
     ending = ending_of(file)
-    if ending == ARCHIVE:
-        return _scans_of_archive(file, name, layout)
     if ending not in (FOLDER, *BAGS):
         read = partial(read_file, file, ending, layout)
         source = str(file.parent / f"*{ending}")
@@ -150,39 +146,6 @@ def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> li
     for index, read_one in enumerate(open_bag(file, ending, topic)):
         name_in_bag = f"{name}/{index:06d}"
         scans.append(NamedScan(name_in_bag, str(file), path=file, ending=ending, read=read_one))
-    return scans
-
-
-def _scans_of_archive(file: Path, name: str, layout: RowLayout) -> list[NamedScan]:
-    """Return the scans of an archive; the files of each of its folders are a recording.
-
-    If no label file may have the name of a member, the member is a broken scan that has a number as
-    its name.
-    """
-    scans = []
-    for index, member in enumerate(list_archive(file)):
-        place = Path(member)
-        fault = fault_of_name(place)
-        if fault is not None:
-            refuse = partial(
-                _refuse,
-                f"{file} ({shown(member)}): expected the name of a scan, found {fault}; rename it "
-                "in the archive",
-            )
-            title = f"{name}/member-{index:06d}"
-            scans.append(NamedScan(title, source=str(file), path=file, ending="", read=refuse))
-            continue
-
-        ending = named_ending(place) or ""
-        scans.append(
-            NamedScan(
-                f"{name}/{member[: len(member) - len(ending)]}",
-                source=str(file / place.parent / f"*{ending}"),
-                path=file,
-                ending=ending,
-                read=partial(read_from_archive, file, member, layout),
-            )
-        )
     return scans
 
 

@@ -12,7 +12,7 @@ from uuid import uuid4
 from amvnet.data.formats import feather, las, numpy_files, packed, pcd, ply, text
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.cloud import COLUMN_NAMES, Arrays, Cloud, Names, make_cloud
-from amvnet.data.formats.detect import ARCHIVE, BAGS, FOLDER, GZIP, TEXT
+from amvnet.data.formats.detect import BAGS, FOLDER, GZIP, TEXT
 from amvnet.data.formats.raw import NUSCENES_ENDING, read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
@@ -43,7 +43,7 @@ COLUMN_READERS: dict[str, Callable[[Path, Names], Arrays]] = {
 
 # The files that are read in the process with limits, and the packages that they need.
 PACKAGES: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys((GZIP, ARCHIVE), ()),
+    GZIP: (),
     ".feather": ("pyarrow",),
     **dict.fromkeys((".las", ".laz"), ("laspy", "lazrs")),
     **dict.fromkeys((FOLDER, *BAGS), ("rosbags",)),
@@ -64,8 +64,6 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     with readable(path):
         if ending == GZIP:
             return Cloud(**_call(read_gzip, path, ending, *_to_json(layout)))
-        if ending == ARCHIVE:
-            raise InputError(f"{path}: expected a file of one scan, found an archive; unpack it")
         if ending in ROW_READERS:
             return ROW_READERS[ending](path, layout)
         return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
@@ -84,17 +82,6 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     """
     columns: Arrays = _call(COLUMN_READERS[ending], path, ending, wanted)
     return columns
-
-
-def list_archive(path: Path) -> list[str]:
-    """Return the names of the scans in an archive; raise InputError if there is none."""
-    names: list[str] = _call(list_members, path, ARCHIVE)["names"]
-    return names
-
-
-def read_from_archive(path: Path, name: str, layout: RowLayout) -> Cloud:
-    """Read a scan of an archive by its name; raise InputError if it is broken."""
-    return Cloud(**_call(read_member, path, ARCHIVE, name, *_to_json(layout)))
 
 
 def _to_json(layout: RowLayout) -> tuple[list[str], list[str]]:
@@ -162,16 +149,6 @@ def _open(path: Path, ending: str, topic: str | None, _opening: str) -> Bag:
 def read_gzip(path: Path, columns: list[str], dtypes: list[str]) -> dict[str, Any]:
     """Return the attributes of the cloud in a file that is packed by gzip."""
     return vars(packed.read_gzip(path, _reader(columns, dtypes)))
-
-
-def list_members(path: Path) -> dict[str, list[str]]:
-    """Return the names of the scans in an archive."""
-    return {"names": packed.member_names(path)}
-
-
-def read_member(path: Path, name: str, columns: list[str], dtypes: list[str]) -> dict[str, Any]:
-    """Return the attributes of a cloud in an archive."""
-    return vars(packed.read_member(path, name, _reader(columns, dtypes)))
 
 
 def _reader(columns: list[str], dtypes: list[str]) -> Callable[[Path, str], Cloud]:
