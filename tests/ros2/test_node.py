@@ -454,7 +454,7 @@ def test_only_scans_in_reach_are_in_memory() -> None:
         scores = rng.dirichlet(np.ones(4), 50).astype(np.float32)
         result = Segmentation(np.ones(50, np.uint8), np.zeros(50, bool), scores)
         fuse(Message(stamp, "lidar"), rng.normal(0, 5, (50, 3)), result)
-        assert scans_in_memory() <= before + REACH + 2
+    assert scans_in_memory() <= before + REACH + 2
 
 
 def test_importing_the_node_does_not_import_torch() -> None:

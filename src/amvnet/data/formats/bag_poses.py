@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.data.formats.bags import ADVICE, EXPECTED, TF_TYPE, Bag, open_reader, types_of
+from amvnet.data.formats.bags import (
+    ADVICE,
+    EXPECTED,
+    LISTED_TOPICS,
+    TF_TYPE,
+    Bag,
+    open_reader,
+    types_of,
+)
 from amvnet.data.formats.cloud import reading
 from amvnet.data.formats.reader_process import call
 from amvnet.data.poses import Poses, timed_poses
@@ -25,6 +33,7 @@ POSE_TYPES = (
     *(ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped"),
     *("geometry_msgs/msg/PoseWithCovarianceStamped", *TF_TYPES),
 )
+LONGEST_CHAIN = 100  # largest number of frames above each other that count
 STATIC = "tf_static"  # the end of the names of topics with transforms that do not change
 
 
@@ -66,7 +75,8 @@ class BagPoses:
         """
         topics = self._topics()
         if topic not in topics:
-            listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items()))
+            listed = sorted(topics.items())[:LISTED_TOPICS]
+            listing = ", ".join(f"{name} ({kind})" for name, kind in listed)
             raise InputError(
                 f"{self.path}: expected the topic {topic} with poses, or a file of this name, "
                 f"found {listing or 'no topic with poses'}; give another topic or file, or leave "
@@ -174,8 +184,10 @@ def _climb(
     """Return the poses of a frame in itself and in all frames above it, by their names, upwards."""
     above = {item.child: item for item in sorted(transforms, key=lambda item: not item.is_fixed)}
     poses: dict[str, Poses] = {frame: np.eye(4)[None]}
-    while frame in above and above[frame].parent not in poses:  # frames may be a circle
+    while frame in above and len(poses) < LONGEST_CHAIN:
         transform = above[frame]
+        if transform.parent in poses:  # the frames are a circle
+            break
         poses[transform.parent] = transform.at(times) @ poses[frame]
         frame = transform.parent
     return poses
