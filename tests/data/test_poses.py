@@ -99,6 +99,18 @@ def test_poses_are_interpolated_at_the_times_of_the_scans(tmp_path: Path) -> Non
         assert turn == pytest.approx(0.03 * (before + 0.5))
 
 
+def test_before_the_first_pose_and_after_the_last_the_motion_goes_on(tmp_path: Path) -> None:
+    """The drive turns steadily, so that its motion goes on exactly."""
+    file = read_poses(write_tum(tmp_path / "tum.txt", POSES[4:-4], first=100.4))
+    np.testing.assert_allclose(file.at([100.0, 102.3], 2), POSES[[0, -1]], atol=1e-9)
+    fails(lambda: file.at([99.8, 102.3], 2), "99.80 to 102.30", "100.40 to 101.90")
+
+
+def test_a_single_pose_is_no_drive(tmp_path: Path) -> None:
+    file = read_poses(write_tum(tmp_path / "tum.txt", POSES[:1]))
+    fails(lambda: file.at([100.0, 100.0], 2), "tum.txt", "100.00 to 100.00")
+
+
 def test_times_that_do_not_overlap_are_one_line(tmp_path: Path) -> None:
     file = read_poses(write_tum(tmp_path / "tum.txt"))
     fails(lambda: file.at([5.0, 5.1], 2), "tum.txt", "5.00 to 5.10", "100.00 to 102.30")

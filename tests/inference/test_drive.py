@@ -10,16 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.poses import Poses
 from amvnet.drives.odometry import Odometry, Pair, check_fit
+from amvnet.inference.drive import find_poses
+from amvnet.inference.listing import list_inputs
 from amvnet.inference.pipeline import Pipeline
 from amvnet.weights.file import save
 
+from fixtures.bag_poses import drive_clouds, drive_odometry, odometry, pose_at, write_bag
 from fixtures.commands import fails, files, refusal, run_cli, succeed
-from fixtures.drives import SCANS, drive_poses, drive_scans, write_drive
+from fixtures.drives import HEIGHT, SCANS, drive_poses, drive_scans, write_drive
 from fixtures.tiny import fresh_weights
 
 POSES = drive_poses()
@@ -189,6 +193,64 @@ def test_evaluate_scores_the_labels_that_predict_writes(world: Path, tmp_path: P
         figures[name] = json.loads((tmp_path / f"{name}.json").read_text())["methods"][name]
     assert figures["drive"] == figures["predictions"]
     assert "--weights" in refusal(f"evaluate {data} --predictions {world}/labels --drive")
+
+
+# ---- poses of a bag
+
+BAG_SCANS = 12
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    messages = [*drive_odometry(BAG_SCANS), *drive_clouds(BAG_SCANS)]
+    return write_bag(tmp_path_factory.mktemp("bag") / "drive", messages)
+
+
+def command_on(bag: Path, world: Path, out: Path, poses: object) -> str:
+    words = f"--weights {world}/w.safetensors --out {out} --height {HEIGHT} --axes x-forward"
+    return f"predict {bag} {words} --drive --poses {poses}"
+
+
+def test_odometry_of_a_bag_labels_as_a_file_of_the_same_poses(
+    world: Path, bag: Path, tmp_path: Path
+) -> None:
+    lines = []
+    for sent in drive_odometry(BAG_SCANS):
+        pose = pose_at(sent.time)
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        lines.append([round(sent.time, 9), *pose[:3, 3], *quaternion])
+    np.savetxt(tmp_path / "tum.txt", lines)
+
+    folders = []
+    for poses in ("/odom", tmp_path / "tum.txt"):
+        folders.append(tmp_path / Path(poses).stem)
+        succeed(command_on(bag, world, folders[-1], poses))
+    assert labels_in(folders[0]) == labels_in(folders[1])
+    assert len(files(folders[0])) == BAG_SCANS
+
+
+def test_a_topic_that_does_not_fit_is_one_line_and_nothing_is_written(
+    world: Path, bag: Path, tmp_path: Path
+) -> None:
+    line = refusal(command_on(bag, world, tmp_path / "out", "/odometry"))
+    assert "/odom (nav_msgs/msg/Odometry)" in line
+    standing = [odometry(sent.time, np.eye(4)) for sent in drive_odometry(BAG_SCANS)]
+    other = write_bag(tmp_path / "standing", [*standing, *drive_clouds(BAG_SCANS)])
+    line = refusal(command_on(other, world, tmp_path / "out", "/odom"))
+    assert "standing" in line
+    assert "apart" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_where_poses_of_a_bag_are_estimated_a_line_names_its_odometry(bag: Path) -> None:
+    pytest.importorskip("kiss_icp")
+    lines: list[str] = []
+    scans, _ = list_inputs([str(bag)])
+    find_poses(scans, report=lines.append)
+    assert lines[0].endswith("; --poses /odom takes those of the bag")
+    assert "by KISS-ICP" in lines[1]
+    find_poses(scans, Path("/odom"), report=lines.append)
+    assert lines[2:] == [f"{bag}: a drive of {BAG_SCANS} scans, 11 m by /odom"]
 
 
 # ---- estimated poses

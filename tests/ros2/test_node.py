@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import subprocess
 import sys
 from array import array
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -18,8 +20,13 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.drives.consensus import REACH, _Seen
 from amvnet.engines.torch import TorchEngine
+from amvnet.inference.segmentation import Segmentation
+from amvnet_ros.fusion import PastFusion
+from amvnet_ros.messages import Message
 
+from fixtures.bag_poses import drive_clouds, drive_odometry, pose_at, write_bag
 from fixtures.commands import succeed
 from fixtures.processes import PATIENCE
 from fixtures.ros import STORE, FakeNode, install, over_the_wire
@@ -34,6 +41,10 @@ RECORD = np.dtype(
         "itemsize": 24,
     }
 )
+DRIVE_SCANS = 6
+# All that is else measured in the first scans, which are others in `predict`.
+SENSOR = {"height": 1.73, "axes": "x-forward", "unit": "m", "rotate": "0,0,0"}
+SENSOR |= {"intensity_scale": 1.0, "sensor": "hdl64e"}
 
 
 def scan(seed: int) -> np.ndarray:
@@ -274,6 +285,176 @@ def test_what_is_assumed_of_the_sensor_is_logged_once(start: Callable[..., Any])
     lines = [text for level, text in node.logger.lines if "assumed" in text]
     assert len(lines) == 1
     assert lines[0].startswith("/points: assumed")
+
+
+# ---- fusion over time
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Messages of a drive and the poses of its LiDAR, by nanoseconds."""
+
+    messages: list[Any]
+    poses: dict[int, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    messages = []
+    for sent in drive_clouds(DRIVE_SCANS):
+        message = sent.make(STORE)
+        message.data = array("B", message.data.tobytes())
+        messages.append(message)
+    odometry = drive_odometry(DRIVE_SCANS)
+    return Drive(messages, {round(sent.time * 1e9): pose_at(sent.time) for sent in odometry})
+
+
+def labels_of(node: Any) -> list[np.ndarray]:
+    """Return the labels of all clouds that the node published."""
+    labels = []
+    for message in node.publishers["~/cloud"].messages:
+        labels.append(np.frombuffer(over_the_wire(message).data, RECORD)["label"])
+    return labels
+
+
+def label_all(node: Any, messages: list[Any]) -> list[np.ndarray]:
+    for message in messages:
+        send(node, message)
+    return labels_of(node)
+
+
+def alone(start: Callable[..., Any], messages: list[Any]) -> list[np.ndarray]:
+    return label_all(start(**SENSOR), messages)
+
+
+def warnings_of(node: Any) -> list[str]:
+    return [text for level, text in node.logger.lines if level == "warning"]
+
+
+def test_scans_are_fused_with_past_scans_as_by_predict_on_a_bag(
+    start: Callable[..., Any], weights: Path, tmp_path: Path, drive: Drive
+) -> None:
+    sent = [*drive_odometry(DRIVE_SCANS), *drive_clouds(DRIVE_SCANS)]
+    bag = write_bag(tmp_path / "bag", sent)
+    options = "--drive --past-only --poses /odom --format npy"
+    for name, value in SENSOR.items():
+        options += f" --{name.replace('_', '-')} {value}"
+    succeed(f"predict {bag} --weights {weights} --out {tmp_path / 'out'} {options}")
+
+    node = start(odom_frame="odom", **SENSOR)
+    node._frames.poses |= drive.poses
+    for number, labels in enumerate(label_all(node, drive.messages)):
+        np.testing.assert_array_equal(labels, np.load(tmp_path / f"out/bag/{number:06d}.npy"))
+    assert not warnings_of(node)
+    alone_labels = alone(start, drive.messages)
+    assert any((a != b).any() for a, b in zip(labels_of(node), alone_labels, strict=True))
+
+
+def test_odometry_that_comes_while_a_scan_is_labelled_counts(
+    start: Callable[..., Any], drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    early = start(odom_frame="odom", **SENSOR)
+    early._frames.poses |= drive.poses
+    expected = label_all(early, drive.messages[:3])
+
+    node = start(odom_frame="odom", **SENSOR)
+    score = TorchEngine.score
+
+    def odometry_and_score(*arguments: Any) -> Any:
+        node._frames.poses |= drive.poses
+        return score(*arguments)
+
+    monkeypatch.setattr(TorchEngine, "score", odometry_and_score)
+    np.testing.assert_array_equal(label_all(node, drive.messages[:3]), expected)
+    assert not warnings_of(node)
+
+
+def test_without_odometry_scans_are_labelled_alone_with_a_warning(
+    start: Callable[..., Any], drive: Drive
+) -> None:
+    messages = drive.messages[:3]
+    expected = alone(start, messages)
+    node = start(odom_frame="odom", **SENSOR)
+    np.testing.assert_array_equal(label_all(node, messages), expected)
+    assert len(warnings_of(node)) == 3  # rclpy throttles them
+    assert "extrapolation" in warnings_of(node)[0]
+
+    node = start(odom_frame="map", **SENSOR)  # tf does not know it
+    node._frames.poses |= drive.poses
+    np.testing.assert_array_equal(label_all(node, messages), expected)
+    assert not any("\n" in line for line in warnings_of(node))
+
+    node = start(odom_frame="odom", **SENSOR)
+    broken = SimpleNamespace(x=np.nan, y=0.0, z=0.0, w=1.0)
+    transform = SimpleNamespace(translation=broken, rotation=broken)
+    node._frames.lookup_transform = lambda *_, **__: SimpleNamespace(transform=transform)
+    np.testing.assert_array_equal(label_all(node, messages), expected)
+    assert "quaternions" in warnings_of(node)[0]
+
+
+def test_a_scan_without_odometry_interrupts_nothing(
+    start: Callable[..., Any], drive: Drive
+) -> None:
+    """The scans around it are fused as if it were not there."""
+    node = start(odom_frame="odom", **SENSOR)
+    node._frames.poses |= drive.poses
+    first, lost, last = drive.messages[:3]
+    expected = label_all(node, [first, last])
+
+    node = start(odom_frame="odom", **SENSOR)
+    node._frames.poses |= drive.poses
+    send(node, first)
+    node._frames.frames = ("odom", "elsewhere")
+    send(node, lost)
+    node._frames.frames = ("odom", "lidar")
+    send(node, last)
+    np.testing.assert_array_equal(labels_of(node)[::2], expected)
+
+
+def test_a_bag_that_starts_again_has_the_labels_of_its_first_time(
+    start: Callable[..., Any], drive: Drive
+) -> None:
+    node = start(odom_frame="odom", **SENSOR)
+    node._frames.poses |= drive.poses
+    first = label_all(node, drive.messages[:4])
+    send(node, drive.messages[0])  # its odometry is not there yet
+    assert len(warnings_of(node)) == 1
+    node._frames.poses |= drive.poses
+    np.testing.assert_array_equal(labels_of(node)[4], alone(start, drive.messages[:1])[0])
+    again = label_all(node, drive.messages[1:4])[5:]
+
+    fresh = start(odom_frame="odom", **SENSOR)
+    fresh._frames.poses |= drive.poses
+    np.testing.assert_array_equal(again, label_all(fresh, drive.messages[1:4]))
+    assert len(first) == 4
+
+
+def test_odometry_that_jumps_starts_anew(start: Callable[..., Any], drive: Drive) -> None:
+    fresh = start(odom_frame="odom", **SENSOR)
+    fresh._frames.poses |= drive.poses
+    expected = label_all(fresh, drive.messages[2:4])
+
+    node = start(odom_frame="odom", **SENSOR)
+    moved = np.eye(4)
+    moved[1, 3] = 10  # within reach of the same walls
+    node._frames.poses |= {time: moved @ pose for time, pose in drive.poses.items()}
+    label_all(node, drive.messages[:2])
+    node._frames.poses |= drive.poses
+    np.testing.assert_array_equal(label_all(node, drive.messages[2:4])[2:], expected)
+
+
+def test_only_scans_in_reach_are_in_memory() -> None:
+    def scans_in_memory() -> int:
+        return sum(type(item) is _Seen for item in gc.get_objects())
+
+    before = scans_in_memory()
+    rng = np.random.default_rng(0)
+    fuse = PastFusion(lambda origin, is_back: np.eye(4))
+    for stamp in range(3 * REACH):
+        scores = rng.dirichlet(np.ones(4), 50).astype(np.float32)
+        result = Segmentation(np.ones(50, np.uint8), np.zeros(50, bool), scores)
+        fuse(Message(stamp, "lidar"), rng.normal(0, 5, (50, 3)), result)
+    assert scans_in_memory() <= before + REACH + 2
 
 
 def test_importing_the_node_does_not_import_torch() -> None:

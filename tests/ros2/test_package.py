@@ -86,7 +86,8 @@ def test_the_manifest_names_every_package_that_is_imported() -> None:
 
     # torch comes with amvnet, which pip installs.
     imported -= {"amvnet", "amvnet_ros", "torch", *sys.stdlib_module_names}
-    imported = {name.replace("numpy", "python3-numpy") for name in imported}
+    of_import = {"numpy": "python3-numpy", "tf2_ros": "tf2_ros_py"}
+    imported = {of_import.get(name, name) for name in imported}
     assert imported == {element.text for element in MANIFEST.findall("exec_depend")}
 
 

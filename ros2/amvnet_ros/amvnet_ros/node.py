@@ -10,20 +10,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.time import Time as RosTime
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header, String
+from tf2_ros import Buffer, TransformException, TransformListener
 
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE
-from amvnet.errors import InputError
+from amvnet.data.poses import timed_poses
+from amvnet.errors import InputError, reason_of
 from amvnet.runtime.threads import wait_passively
 from amvnet_ros.health import Health, Labelled
 from amvnet_ros.messages import (
@@ -31,6 +36,7 @@ from amvnet_ros.messages import (
     HEADER_TYPE,
     NANOSECONDS,
     TIME_TYPE,
+    Message,
     encode_labels,
 )
 from amvnet_ros.newest import NewestOnly
@@ -44,6 +50,7 @@ WRONG_INPUT = 2
 TYPES = {CLOUD_TYPE: PointCloud2, FIELD_TYPE: PointField, HEADER_TYPE: Header, TIME_TYPE: Time}
 REPORT_PERIOD = 1.0  # the time between two reports, seconds
 REFUSAL_PERIOD = 5.0  # the least time between two lines of the log about broken clouds, seconds
+ODOMETRY_WAIT = 0.1  # longest time to wait for odometry that comes after its scan, seconds
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,13 @@ class SegmentNode(Node):
         self.exit_code = DONE
         settings = self._declare_settings()
         topic = self.resolve_topic_name("points")
-        self._segment = CloudSegmenter(settings, topic, self.get_logger().info)
+        self._odom_frame = settings.odom_frame
+        find_pose = None
+        if self._odom_frame:
+            self._frames = Buffer()
+            self._listener = TransformListener(self._frames, self)
+            find_pose = self._find_pose
+        self._segment = CloudSegmenter(settings, topic, self.get_logger().info, find_pose)
         self._hardware = self._segment.hardware
         self._health = Health(self._segment.usual_uncertain)
         self._report_time = time.monotonic()
@@ -136,6 +149,32 @@ class SegmentNode(Node):
                 uncertain=labelled.uncertain_share,
             )
         )
+
+    def _find_pose(self, origin: Message, is_back: bool) -> Any:
+        """Return the pose (4, 4) of a scan at its stamp, or None if tf does not know it.
+
+        Args:
+            origin: the stamp and the frame of the scan.
+            is_back: whether the time went backwards; then tf's transforms are of another run.
+        """
+        if is_back:
+            self._frames.clear()  # fixed transforms stay
+        try:
+            found = self._frames.lookup_transform(
+                self._odom_frame,
+                origin.frame_id,
+                time=RosTime(nanoseconds=origin.stamp),
+                timeout=Duration(seconds=ODOMETRY_WAIT),
+            )
+            place, turn = found.transform.translation, found.transform.rotation
+            row = [0.0, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
+            return timed_poses(self._odom_frame, np.array([row])).poses[0]
+        except (TransformException, InputError) as error:
+            self.get_logger().warning(
+                f"a scan is labelled alone, without past scans: {reason_of(error)}",
+                throttle_duration_sec=REFUSAL_PERIOD,
+            )
+            return None
 
     def _fail(self, error: Exception) -> None:
         """End the node: the error is not due to the message, so that it would come again."""

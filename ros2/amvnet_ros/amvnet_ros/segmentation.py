@@ -11,6 +11,7 @@ import numpy as np
 
 from amvnet.data.formats.cloud import reading
 from amvnet.data.formats.pointcloud2 import read_message
+from amvnet_ros.fusion import FindPose, PastFusion
 from amvnet_ros.messages import LabelledPoints, Message
 
 
@@ -38,6 +39,9 @@ class Settings:
     axes: str = _parameter("", "x-forward, y-forward, z-forward, z-down or y-up; empty: measured")
     rotate: str = _parameter("", "yaw,pitch,roll in degrees that level the scan; empty: measured")
     offset: str = _parameter("", "x,y,z in metres, added after the rotation")
+    odom_frame: str = _parameter(
+        "", "a frame of tf that stands still, such as odom: fuse past scans; empty: no fusion"
+    )
 
     def sensor_options(self) -> dict[str, Any]:
         """Return the arguments of `make_sensor`; None stands for a value to be measured."""
@@ -72,7 +76,8 @@ class CloudSegmenter:
     """Labels messages of one sensor.
 
     The sensor is measured in the first messages, as `amvnet predict` measures it in the first scans
-    of a folder.
+    of a folder. With poses, each scan is fused with scans before it, as by `predict --drive
+    --past-only`.
 
     Attributes:
         taxonomy: the classes.
@@ -84,12 +89,20 @@ class CloudSegmenter:
         settings: the parameters of the node.
         topic: the topic of the messages, for lines of the log.
         report: called once with what was assumed about the sensor.
+        find_pose: returns the pose of a scan, given its message and whether its time is before that
+            of the last scan, or None if there is no pose. Without it, no scans are fused.
 
     Raises:
         InputError: if a parameter is wrong.
     """
 
-    def __init__(self, settings: Settings, topic: str, report: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        topic: str,
+        report: Callable[[str], None],
+        find_pose: FindPose | None = None,
+    ) -> None:
         # Imported late: the node sets the environment before torch reads it.
         import torch
 
@@ -117,6 +130,7 @@ class CloudSegmenter:
         self._topic = topic
         self._normalise = normaliser_for(segmenter.weights, sensor, report)
         self._segment = segmenter
+        self._fuse = None if find_pose is None else PastFusion(find_pose)
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)
 
     def __call__(self, message: Any) -> LabelledCloud:
@@ -131,6 +145,8 @@ class CloudSegmenter:
 
         scan = self._normalise(cloud, self._topic)
         result = self._segment(scan)
+        if self._fuse is not None:  # last, because odometry often comes after its scan
+            result = self._fuse(origin, cloud.xyz, result)
         verdict = result.verdict  # None for a single network
         points = LabelledPoints(
             cloud.xyz,

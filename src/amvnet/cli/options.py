@@ -253,7 +253,8 @@ class DriveOptions:
     places."""
     poses: Path | None = None
     """with --drive, the poses of the LiDAR: KITTI's lines of 12 numbers, TUM's lines of time x y z
-    qx qy qz qw, or .npy (N, 4, 4); default: the dataset's, or estimated by KISS-ICP."""
+    qx qy qz qw, .npy (N, 4, 4), or a bag's topic of odometry, poses or tf; default: the dataset's,
+    or estimated by KISS-ICP."""
     past_only: bool = False
     """with --drive, fuse each scan only with scans before it, as on a robot."""
 

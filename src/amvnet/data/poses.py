@@ -1,4 +1,4 @@
-"""Read the poses of a drive from a file: KITTI's, TUM's or NumPy's format."""
+"""Read the poses of a drive from a file: KITTI's, TUM's or NumPy's format; interpolate poses."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from amvnet.errors import InputError
 KITTI_COLUMNS = 12  # the upper three rows of a 4 x 4 matrix
 TUM_COLUMNS = 8  # time x y z qx qy qz qw
 CALIBRATION = "calib.txt"  # KITTI's file next to its poses; its `Tr` moves points into camera 0
+FARTHEST = 1e8  # largest coordinate of a pose, metres: more than the radius of the Earth
+EDGE = 0.5  # seconds before the first pose and after the last one in which the motion goes on
 TOLERANCE = 0.01  # largest error of a rotation matrix or of the length of a quaternion
 EXPECTED = (
     "poses: lines of 12 numbers (KITTI), lines of time x y z qx qy qz qw (TUM), or .npy of shape "
@@ -26,16 +28,16 @@ Poses = NDArray[np.float64]  # (N, 4, 4); each moves points of the sensor into t
 
 
 @dataclass(frozen=True)
-class PoseFile:
-    """The poses of a file.
+class Trajectory:
+    """The poses of a file or of a topic.
 
     Attributes:
-        path: the file.
+        name: the file or the topic, for messages.
         poses: (N, 4, 4) float64, each moves points of the sensor into the world.
         times: (N,) seconds, ascending, or None if the file has none.
     """
 
-    path: Path
+    name: str
     poses: Poses
     times: NDArray[np.float64] | None = None
 
@@ -43,7 +45,7 @@ class PoseFile:
         """Return the poses (count, 4, 4) of some scans.
 
         A file with as many poses as scans has them in the order of the scans. Otherwise the times
-        decide, and poses are interpolated between the two nearest ones.
+        decide (`interpolate`).
 
         Args:
             times: the time of each scan, seconds, or None if the times are unknown.
@@ -57,27 +59,52 @@ class PoseFile:
         if self.times is None or times is None:
             of = "" if self.times is None else ", or scans whose names are their times in seconds"
             raise InputError(
-                f"{self.path}: expected a pose for each of {count} scans{of}, found "
+                f"{self.name}: expected a pose for each of {count} scans{of}, found "
                 f"{len(self.poses)} poses; give the poses of these scans in their order"
             )
+        return self.interpolate(times)
 
+    def interpolate(self, times: Sequence[float] | NDArray[np.float64]) -> Poses:
+        """Return the poses (M, 4, 4) at some times in seconds, between the two nearest poses.
+
+        Recordings seldom begin and end with a pose: up to `EDGE` seconds before the first pose and
+        after the last one, the sensor moves as it does there.
+
+        Raises:
+            InputError: if the poses belong to other times.
+        """
+        assert self.times is not None
         first, last = self.times[0], self.times[-1]
-        scan_times = np.asarray(times)
-        if scan_times.min() < first or scan_times.max() > last:
+        scan_times = np.asarray(times, np.float64)
+        edge = min(EDGE, last - first)  # 0 for a single pose
+        is_inside = first - edge <= scan_times.min() and scan_times.max() <= last + edge
+        if not edge or not is_inside:
             raise InputError(
-                f"{self.path}: expected times that include the scans' ({scan_times.min():.2f} to "
+                f"{self.name}: expected times that include the scans' ({scan_times.min():.2f} to "
                 f"{scan_times.max():.2f} s), found {first:.2f} to {last:.2f} s; give the poses of "
                 "this drive, by the same clock"
             )
-        poses = np.tile(np.eye(4), (count, 1, 1))
+
+        # The motion from the end to a time after it is the motion to the end, as long before it.
+        end = np.clip(scan_times, first, last)
+        poses = self._within((2 * end - scan_times).clip(first, last))
+        is_outside = scan_times != end
+        at_end = self._within(end[is_outside])
+        poses[is_outside] = at_end @ np.linalg.inv(poses[is_outside]) @ at_end
+        return poses
+
+    def _within(self, times: NDArray[np.float64]) -> Poses:
+        """Return the poses (M, 4, 4) at times from the first pose to the last one."""
+        assert self.times is not None
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
         rotations = Slerp(self.times, Rotation.from_matrix(self.poses[:, :3, :3]))
-        poses[:, :3, :3] = rotations(scan_times).as_matrix()
+        poses[:, :3, :3] = rotations(times).as_matrix()
         for axis in range(3):
-            poses[:, axis, 3] = np.interp(scan_times, self.times, self.poses[:, axis, 3])
+            poses[:, axis, 3] = np.interp(times, self.times, self.poses[:, axis, 3])
         return poses
 
 
-def read_poses(path: Path) -> PoseFile:
+def read_poses(path: Path) -> Trajectory:
     """Read poses of the sensor.
 
     KITTI's poses are poses of camera 0. They are turned into poses of the LiDAR if `calib.txt` with
@@ -101,26 +128,54 @@ def read_poses(path: Path) -> PoseFile:
         raise InputError(f"{path}: expected {EXPECTED}, found another file; convert it") from None
 
     shape = table.shape
-    times = None
     if table.dtype.kind in "fiu" and table.ndim == 3 and shape[1:] in ((4, 4), (3, 4)):
         poses = table.astype(np.float64)[:, :3]
     elif table.dtype.kind in "fiu" and table.ndim == 2 and shape[1] == KITTI_COLUMNS:
         poses = table.astype(np.float64).reshape(-1, 3, 4)
     elif table.dtype.kind in "fiu" and table.ndim == 2 and shape[1] == TUM_COLUMNS:
-        times = table[:, 0].astype(np.float64)
-        poses = _from_tum(path, table)
+        return timed_poses(str(path), table.astype(np.float64))
     else:
         raise InputError(f"{path}: expected {EXPECTED}, found shape {shape}; convert it")
 
     whole = np.tile(np.eye(4), (len(poses), 1, 1))
     whole[:, :3] = poses
     check_rigid(whole, str(path))
-    if times is not None and not (np.diff(times) > 0).all():
-        raise InputError(f"{path}: expected ascending times in column 1, found others; sort them")
     calibration = path.with_name(CALIBRATION)
     if shape[1:] == (KITTI_COLUMNS,) and calibration.is_file():
         whole = _from_camera(whole, calibration)
-    return PoseFile(path, whole, times)
+    return Trajectory(str(path), whole)
+
+
+def timed_poses(name: str, table: NDArray[np.float64]) -> Trajectory:
+    """Return the poses of a table (N, 8) of time x y z qx qy qz qw, in seconds and metres.
+
+    Args:
+        name: the file or the topic, for messages.
+        table: the table.
+
+    Raises:
+        InputError: if there is no pose, a quaternion has not the length 1, a value is no number, or
+            the times do not ascend.
+    """
+    quaternions = table[:, 4:]
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(quaternions, axis=1)
+    is_unit = np.abs(lengths - 1) < TOLERANCE  # false for NaN
+    if not is_unit.all():
+        index = int(np.argmin(is_unit))
+        raise InputError(
+            f"{name}: expected unit quaternions qx qy qz qw, found "
+            f"{' '.join(f'{value:g}' for value in quaternions[index])} in pose {index}; correct "
+            "it, or convert angles"
+        )
+
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    poses[:, :3, 3] = table[:, 1:4]
+    check_rigid(poses, name)
+    if not (np.diff(table[:, 0]) > 0).all():
+        raise InputError(f"{name}: expected ascending times, found others; sort them")
+    return Trajectory(name, poses, table[:, 0])
 
 
 def check_rigid(poses: Poses, name: str) -> None:
@@ -128,35 +183,20 @@ def check_rigid(poses: Poses, name: str) -> None:
     if not len(poses):
         raise InputError(f"{name}: expected poses, found none; give a pose for each scan")
     rotations = poses[:, :3, :3]
-    products = rotations @ rotations.transpose(0, 2, 1)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
+        products = rotations @ rotations.transpose(0, 2, 1)
         is_rigid = np.isfinite(poses).all(axis=(1, 2))
+        is_rigid &= np.abs(poses[:, :3, 3]).max(axis=1) < FARTHEST
         is_rigid &= np.abs(products - np.eye(3)).max(axis=(1, 2)) < TOLERANCE
         is_rigid &= np.linalg.det(np.where(np.isfinite(rotations), rotations, 0)) > 0
     if not is_rigid.all():
         index = int(np.argmin(is_rigid))
         is_finite = np.isfinite(poses[index]).all()
-        fault = "no rotation" if is_finite else "a value that is no number"
+        fault = f"no rotation, or more than {FARTHEST:g} m," if is_finite else "no number"
         raise InputError(
             f"{name}: expected rotations and translations in metres, found {fault} in pose "
             f"{index}; correct it"
         )
-
-
-def _from_tum(path: Path, table: np.ndarray) -> NDArray[np.float64]:
-    """Return the (N, 3, 4) poses of lines of time x y z qx qy qz qw."""
-    quaternions = table[:, 4:].astype(np.float64)
-    lengths = np.linalg.norm(quaternions, axis=1)
-    is_unit = np.abs(lengths - 1) < TOLERANCE  # false for NaN
-    if not is_unit.all():
-        index = int(np.argmin(is_unit))
-        raise InputError(
-            f"{path}: expected unit quaternions qx qy qz qw in the last four columns, found "
-            f"{' '.join(f'{value:g}' for value in table[index, 4:])} in pose {index}; angles must "
-            "be converted"
-        )
-    rotations = Rotation.from_quat(quaternions).as_matrix()
-    return np.concatenate((rotations, table[:, 1:4, None]), axis=2)
 
 
 def _from_camera(poses: Poses, calibration: Path) -> Poses:

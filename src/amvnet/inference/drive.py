@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from amvnet.data.formats.bag_poses import BagPoses
 from amvnet.data.poses import Poses, check_rigid, read_poses
 from amvnet.data.spacing import evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit
 from amvnet.errors import InputError
-from amvnet.inference.listing import DatasetScan, InputScan, LoadedScan, Outcome
+from amvnet.inference.listing import DatasetScan, FileScan, InputScan, LoadedScan, Outcome
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
@@ -35,7 +36,8 @@ class DriveChoice:
     """How the scores of drives are fused over time.
 
     Attributes:
-        poses: the file of the poses; by default, they come from the dataset, or are estimated.
+        poses: the file of the poses, or the topic of a bag; by default, they come from the dataset,
+            or are estimated.
         past_only: whether scans after a scan do not count.
     """
 
@@ -216,25 +218,28 @@ def find_poses(
 ) -> Drives:
     """Find the poses of the scans of one or several drives, and check that they fit the scans.
 
-    They come from a file, from the dataset, or from KISS-ICP. A line for each drive says which.
+    They come from a file, from a topic of the bag, from the dataset, or from KISS-ICP. A line for
+    each drive says which.
 
     Args:
         scans: the scans; those of each recording are in order.
-        path: the file of the poses of the only drive (`read_poses`).
+        path: the file of the poses of the only drive (`read_poses`), or a topic of bags, if no file
+            has this name (`BagPoses`).
         past_only: whether only scans before a scan will count.
         is_one: whether all scans must be of one drive.
         progress: called with the number of scans whose poses are estimated, and their total.
         report: takes the lines.
 
     Raises:
-        InputError: if a recording has a single scan; if the file does not have a pose for each
-            scan, or is given for several drives; if the poses do not fit the scans; or if a scan
-            cannot be read or kiss-icp is missing where poses are estimated.
+        InputError: if a recording has a single scan; if the file or the topic does not have a pose
+            for each scan, or a file is given for several drives; if the poses do not fit the scans;
+            or if a scan cannot be read or kiss-icp is missing where poses are estimated.
     """
     sources: dict[str, list[InputScan]] = {}
     for scan in scans:
         sources.setdefault(scan.source, []).append(scan)
-    if (path is not None or is_one) and len(sources) > 1:
+    is_file = path is not None and path.is_file()
+    if (is_file or is_one) and len(sources) > 1:
         raise InputError(
             f"expected the scans of one drive, found {len(sources)} recordings "
             f"({', '.join(list(sources)[:3])}, ...); choose one, with --sequences or as INPUT"
@@ -249,19 +254,14 @@ def find_poses(
     found: dict[tuple[str, str], Poses] = {}
     of_files = path is not None
     for source, members in sources.items():
-        name = source
-        poses = None
-        if path is not None:
-            name = str(path)
-            poses = read_poses(path).at(_times(members), len(members))
-        elif isinstance(members[0], DatasetScan):
-            records = [scan.record for scan in members if isinstance(scan, DatasetScan)]
-            poses = members[0].dataset.poses(records)
-        where = "the file" if path is not None else "the dataset"
+        name = str(path) if is_file else source
+        poses, where = _recorded(members, path, report)
         if poses is None:
-            report(f"{name}: estimating the poses of {counted(len(members), 'scan')}")
-            poses = _estimated(members, progress)
-            where = "KISS-ICP"
+            bag = _bag_of(members)
+            topic = None if bag is None else bag.odometry()
+            other = "" if topic is None else f"; --poses {topic} takes those of the bag"
+            report(f"{name}: estimating the poses of {counted(len(members), 'scan')}{other}")
+            poses, where = _estimated(members, progress), "KISS-ICP"
 
         check_rigid(poses, name)
         check_fit(_pairs(members, poses, of_files), name)
@@ -269,6 +269,24 @@ def find_poses(
         report(f"{name}: a drive of {counted(len(members), 'scan')}, {metres:.0f} m by {where}")
         found |= {key_of(scan): pose for scan, pose in zip(members, poses, strict=True)}
     return Drives(found, of_files, past_only)
+
+
+def _recorded(
+    scans: Sequence[InputScan], path: Path | None, report: Reporter
+) -> tuple[Poses | None, str]:
+    """Return the poses (N, 4, 4) of a drive, or None if they are unknown, and what holds them."""
+    if path is not None:
+        bag = _bag_of(scans)
+        if bag is not None and not path.is_file():
+            return bag.at_scans(path.as_posix(), report), path.as_posix()
+        track = read_poses(path)
+        # All of a bag is read for the times of its scans.
+        times = None if len(track.poses) == len(scans) else _times(scans)
+        return track.at(times, len(scans)), "the file"
+
+    records = [scan.record for scan in scans if isinstance(scan, DatasetScan)]
+    first = scans[0]
+    return first.dataset.poses(records) if isinstance(first, DatasetScan) else None, "the dataset"
 
 
 def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:
@@ -285,8 +303,21 @@ def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:
     return np.array(poses)
 
 
+def _bag_of(scans: Sequence[InputScan]) -> BagPoses | None:
+    """Return the poses of the bag that holds the scans of a recording, or None if it is no bag."""
+    first = scans[0]
+    return first.scan.bag_poses if isinstance(first, FileScan) else None
+
+
 def _times(scans: Sequence[InputScan]) -> list[float] | None:
-    """Return the times of scans whose names are numbers of seconds or nanoseconds, or None."""
+    """Return the times of scans in seconds: their stamps in a bag, or numbers that are their names.
+
+    Return None if a name is no number. Large numbers are nanoseconds.
+    """
+    bag = _bag_of(scans)
+    if bag is not None:
+        return bag.times()
+
     times = []
     for scan in scans:
         with suppress(ValueError):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
 
 from amvnet.data.formats.cloud import Cloud, reading
 from amvnet.data.formats.detect import FOLDER
@@ -16,6 +20,9 @@ from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
 from amvnet.errors import InputError
 
 LISTED_TOPICS = 10  # largest number of topics that an error message lists
+
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 
 CHUNK = 1 << 20  # the bytes that are unpacked at a time
 MIN_MESSAGE = 16  # the smallest size of a message in a bag, even if it is compressed, bytes
@@ -40,7 +47,7 @@ class Bag:
         with reading(path, EXPECTED, ADVICE):
             if ending == FOLDER:
                 _check_unpacked(path)
-            with closing(_open_reader(path, ending)) as reader:
+            with closing(open_reader(path, ending)) as reader:
                 topic, count = _choose_topic(reader.connections, topic, path)
 
         if not 0 < count <= size_of(path) // MIN_MESSAGE:
@@ -80,8 +87,31 @@ class Bag:
 
         raise InputError(f"{name}: expected {self._count} scans, found {self._next}; {ADVICE}")
 
+    def headers(self) -> tuple[NDArray[np.float64], str]:
+        """Return the time stamp of each scan (N,) in seconds, and the frame of the first scan.
+
+        Only headers are decoded, so that scans with broken points have a time, too.
+
+        Raises:
+            InputError: if there are more or fewer scans than the bag states, or a header is broken.
+        """
+        times = []
+        frames: list[str] = []
+        with reading(self._path, "scans with headers", ADVICE):
+            for data in self._messages():
+                # In ROS 1, a number comes first, and in ROS 2, two bytes that tell the byte order.
+                order = "<" if self._ending == ".bag" or data[1] else ">"
+                seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
+                times.append(seconds + nanoseconds * 1e-9)
+                frames = frames or [bytes(data[16 : 16 + length]).rstrip(b"\0").decode()]
+        if len(times) != self._count:
+            raise InputError(
+                f"{self._path}: expected {self._count} scans, found {len(times)}; {ADVICE}"
+            )
+        return np.array(times), frames[0]
+
     def _messages(self) -> Iterator[bytes]:
-        with closing(_open_reader(self._path, self._ending)) as reader:
+        with closing(open_reader(self._path, self._ending)) as reader:
             connections = _with_scans(reader.connections)
             chosen = [connection for connection in connections if connection.topic == self._topic]
             for _, _, data in reader.messages(connections=chosen):
@@ -95,7 +125,7 @@ class Bag:
         return read_message(deserialise(data, CLOUD_TYPE), name)
 
 
-def _open_reader(path: Path, ending: str) -> Any:
+def open_reader(path: Path, ending: str) -> Any:
     """Open a bag with rosbags; `ending` decides the format, not the name of the file."""
     from rosbags.rosbag1 import Reader
     from rosbags.rosbag2.reader import DirectoryReader
@@ -145,9 +175,13 @@ def _check_unpacked(folder: Path) -> None:
 @cache
 def types_of(is_ros1: bool) -> Any:
     """Return rosbags' store of the message types of ROS 1 or ROS 2."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    if not is_ros1:
+        return get_typestore(Stores.ROS2_HUMBLE)
+    types = get_typestore(Stores.ROS1_NOETIC)  # has no package tf2_msgs
+    types.register(get_types_from_msg(TF_DEFINITION, TF_TYPE))
+    return types
 
 
 def _with_scans(connections: Iterable[Any]) -> list[Any]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from amvnet.data.formats.bag_poses import BagPoses
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import (
     BAGS,
@@ -44,6 +45,7 @@ class NamedScan:
         ending: the ending that belongs to the file's content (`ending_of`); empty for a broken
             file.
         read: reads the scan.
+        bag_poses: reads the poses of all scans of a bag; None for a file.
     """
 
     name: str
@@ -51,6 +53,7 @@ class NamedScan:
     path: Path
     ending: str
     read: Callable[[], Cloud]
+    bag_poses: BagPoses | None = None
 
 
 def find_scans(path: Path | str) -> list[Path]:
@@ -143,9 +146,9 @@ def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> li
         return [NamedScan(name, source, path=file, ending=ending, read=read)]
 
     scans = []
+    poses = BagPoses(file, ending, topic)
     for index, read_one in enumerate(open_bag(file, ending, topic)):
-        name_in_bag = f"{name}/{index:06d}"
-        scans.append(NamedScan(name_in_bag, str(file), path=file, ending=ending, read=read_one))
+        scans.append(NamedScan(f"{name}/{index:06d}", str(file), file, ending, read_one, poses))
     return scans
 
 
