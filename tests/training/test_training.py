@@ -173,17 +173,15 @@ def test_the_class_counts_of_a_run_are_those_of_its_training_scans(world: Path, 
         assert count == np.count_nonzero(raw_labels == raw_ids.get(index, -1))
 
 
-def test_the_check_of_the_scans_reports_ten_times_and_only_once(
+def test_the_check_of_the_scans_reports_ten_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("amvnet.progress.QUIET_SECONDS", 0)
-    monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "cache"))
     dataset = open_dataset(str(make_streets(tmp_path / "data", ("00", "08"), 23)))
     scans = TrainingScans(dataset, dataset.records(["00"]), [])
     lines: list[str] = []
     plan = Plan(load_recipe("semantickitti-compact"), scans, tmp_path / "run", report=lines.append)
-    counts = [check_data(plan)[0].tolist() for _ in range(2)]  # the second time from the cache
-    assert counts[0] == counts[1]
+    check_data(plan)
     checked = [line.partition(": checked")[2] for line in lines if ": checked" in line]
     assert len(checked) == 10
     assert checked[-1] == " 23 of 23 scans"

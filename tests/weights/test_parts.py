@@ -11,10 +11,9 @@ import torch
 import amvnet
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
-from amvnet.models.layers import ResidualBlock
 from amvnet.models.methods import MethodName
 from amvnet.weights.file import PARTS, Weights
-from amvnet.weights.parts import for_classes, grown, replace_part
+from amvnet.weights.parts import for_classes, replace_part
 
 from fixtures.tiny import fresh_weights, street, without
 
@@ -147,60 +146,3 @@ def test_weights_for_other_classes_leave_the_random_state_as_it_was() -> None:
     torch.manual_seed(5)
     for_classes(weights, few, seed=1)
     assert torch.equal(torch.rand(3), expected)
-
-
-def test_a_deeper_network_begins_as_the_shallower_one() -> None:
-    weights = fresh_weights()
-    net = weights.model.range_net
-    more = tuple(blocks + 1 for blocks in net.blocks)
-    model = replace(weights.model, range_net=replace(net, blocks=more, stem_blocks=2))
-
-    deeper = grown(weights, "range_net", model, seed=0)
-    assert deeper is not None
-    assert deeper.model.range_net.blocks == more
-    assert deeper.parts == weights.parts
-    assert deeper.digest("polar_net") == weights.digest("polar_net")
-    assert "range_net" in weights.metrics
-    assert "range_net" not in deeper.metrics  # nobody has measured the deeper network
-    assert deeper.training == weights.training  # which scans the network takes
-
-    # Only the leak of the added activations differs.
-    points, _ = street(0)
-    before = amvnet.load(weights, method="rv")(points).scores
-    after = amvnet.load(deeper, method="rv")(points).scores
-    np.testing.assert_allclose(after, before, atol=0.05)
-    assert (after.argmax(axis=1) == before.argmax(axis=1)).mean() > 0.95
-
-    # Every parameter of the new blocks can learn once their scale is not 0.
-    module = deeper.build().range_net
-    zeros = 0
-    for block in module.modules():
-        if isinstance(block, ResidualBlock):
-            scale = block.second[1].weight
-            assert isinstance(scale, torch.Tensor)
-            zeros += int((scale == 0).all())
-    assert zeros == 2 + len(more)
-
-
-def test_a_network_with_steps_begins_as_the_network_without() -> None:
-    weights = fresh_weights()
-    assert not weights.model.range_net.steps
-    net = replace(weights.model.range_net, steps=True)
-    with_steps = grown(weights, "range_net", replace(weights.model, range_net=net), seed=0)
-    assert with_steps is not None
-    assert with_steps.model.range_net.steps
-
-    points, _ = street(0)
-    before = amvnet.load(weights, method="rv")(points).scores
-    after = amvnet.load(with_steps, method="rv")(points).scores
-    np.testing.assert_allclose(after, before, atol=1e-5)
-    assert grown(with_steps, "range_net", weights.model, seed=0) is None  # steps are kept
-
-
-def test_other_differences_cannot_be_grown() -> None:
-    weights = fresh_weights()
-    net = weights.model.range_net
-    wider = replace(weights.model, range_net=replace(net, decoder=net.decoder + 8))
-    fewer = replace(weights.model, range_net=replace(net, gru=False))
-    assert grown(weights, "range_net", wider, seed=0) is None
-    assert grown(weights, "range_net", fewer, seed=0) is None

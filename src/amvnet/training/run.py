@@ -31,7 +31,7 @@ from amvnet.training.run_folder import (
     write_record,
 )
 from amvnet.weights.file import Weights, save
-from amvnet.weights.parts import SIZES, fits, for_classes, grown, replace_part, resized
+from amvnet.weights.parts import SIZES, fits, for_classes, replace_part, resized
 
 
 def train(
@@ -156,13 +156,12 @@ def first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> W
         if name == "head" and name in trained and not fits(init, part, plan.recipe.model):
             plan.report("head: new, because the head of the initial weights has other sizes")
             continue
-        begin = _grown(plan, init, part) if name in trained else init
         if init.taxonomy.classes == weights.taxonomy.classes:
-            weights = replace_part(weights, part, begin)
+            weights = replace_part(weights, part, init)
             if name not in trained:
                 _report_kept(plan, init, part)
         elif name in trained:
-            weights = replace_part(weights, part, _for_classes(plan, begin, part))
+            weights = replace_part(weights, part, _for_classes(plan, init, part))
 
     return _with_finished(plan, weights)
 
@@ -177,17 +176,6 @@ def _report_kept(plan: Plan, init: Weights, part: str) -> None:
                 kept.append(f"{key} is {value}, not {of_recipe[key]}")
     if kept:
         plan.report(f"{part}: is not trained, so it stays as in --init: {'; '.join(kept)}")
-
-
-def _grown(plan: Plan, init: Weights, part: str) -> Weights:
-    """Return initial weights in which a part has the residual blocks and steps of the recipe."""
-    if part == "point_head" or fits(init, part, plan.recipe.model):
-        return init
-    larger = grown(init, part, plan.recipe.model, plan.recipe.training.seed)
-    if larger is None:
-        return init
-    plan.report(f"{part}: the initial weights, with new layers that begin without effect")
-    return larger
 
 
 def _with_finished(plan: Plan, weights: Weights) -> Weights:

@@ -1,19 +1,17 @@
-"""Change the parts of weights: replace one, or change its sizes, classes or depth."""
+"""Change the parts of weights: replace one, or change its sizes or classes."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
-from amvnet.models.layers import ResidualBlock
 from amvnet.weights.file import Weights
 
 # The fields of `ModelConfig` that set the sizes of each part.
@@ -120,68 +118,6 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
             new.append(key)
     begun = dataclasses.replace(weights, taxonomy=taxonomy, tensors=tensors)
     return dataclasses.replace(begun, metrics={}), new
-
-
-def grown(weights: Weights, part: str, model: ModelConfig, seed: int) -> Weights | None:
-    """Return weights in which one part has the residual blocks and steps of a larger configuration.
-
-    The part keeps its parameters. A new block begins as a skip connection: the scale of its last
-    batch norm is 0 (Goyal et al., 2017). New channels of the input (`RangeNetConfig.steps`) begin
-    with a kernel of 0. The larger network therefore computes the same as the smaller one, except
-    for the leak of one more activation in each new block.
-
-    Args:
-        weights: trained weights that hold the part.
-        part: "range_net" or "polar_net".
-        model: the configuration with the sizes of the larger part.
-        seed: the seed of the other parameters of the new blocks.
-
-    Returns:
-        The weights, without the part's metrics; None if the parts differ in more than residual
-        blocks and steps. The record of the part's earlier training stays, because it says what
-        scans the network takes.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        module = getattr(build_amvnet(model, weights.taxonomy.size), part)
-
-    blocks = []
-    for name, layer in module.named_modules():
-        if isinstance(layer, ResidualBlock):
-            blocks.append(f"{name}.")
-            if not any(key.startswith(f"{part}.{name}.") for key in weights.tensors):
-                torch.nn.init.zeros_(cast(Tensor, layer.second[1].weight))
-
-    known = weights.part(part)
-    fresh = module.state_dict()
-    if model.range_net.steps and part == "range_net":
-        known = _with_steps(known, fresh)
-    is_larger = all(key in fresh and fresh[key].shape == known[key].shape for key in known)
-    is_new_block = all(key.startswith(tuple(blocks)) for key in fresh.keys() - known.keys())
-    if not is_larger or not is_new_block:
-        return None
-
-    tensors = {key: value for key, value in weights.tensors.items() if not key.startswith(part)}
-    for key, value in (fresh | known).items():
-        tensors[f"{part}.{key}"] = value.contiguous()
-    return dataclasses.replace(
-        resized(weights, part, model),
-        tensors=tensors,
-        metrics=_with_entry(weights.metrics, {}, part),
-    )
-
-
-def _with_steps(known: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return parameters of a range view whose first layers take as many channels as fresh ones."""
-    widened = dict(known)
-    for name in ("weight", "bias", "running_mean", "running_var"):
-        norm = known[f"input_norm.{name}"]
-        widened[f"input_norm.{name}"] = torch.cat([norm, fresh[f"input_norm.{name}"][len(norm) :]])
-
-    kernel = known["stem.0.weight"]  # (C', C, 3, 3)
-    channels = fresh["stem.0.weight"].shape[1] - kernel.shape[1]
-    widened["stem.0.weight"] = torch.cat([kernel, kernel.new_zeros(len(kernel), channels, 3, 3)], 1)
-    return widened
 
 
 def _with_entry(records: Mapping[str, Any], others: Mapping[str, Any], part: str) -> dict[str, Any]:
