@@ -20,6 +20,7 @@ from amvnet.data.datasets.select import split_records
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.laser_order import with_lasers
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.sensors.expectation import Expectation
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, drive_street, simulate, writing
 
@@ -266,7 +267,7 @@ def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
 ) -> None:
     dataset = SimulatedStreets(tmp_path)
     config = AugmentConfig(mix=0.5, laser_mix=0.5, paste=0.5)
-    scans = ScanSet(dataset, dataset.records(["0", "1"]), config)
+    scans = ScanSet(dataset, dataset.records(["0", "1"]), Expectation(), config)
     loader = make_loader(scans, batch=3, workers=workers, shuffle=True)
     for epoch in (0, 1):
         loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
@@ -285,7 +286,7 @@ def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
 
 def test_validation_has_the_same_streets_in_every_epoch(tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path)
-    scans = ScanSet(dataset, dataset.records(["7"]))
+    scans = ScanSet(dataset, dataset.records(["7"]), Expectation())
     assert scans[4, 2].name == scans[0, 2].name == "000007/000002"
 
 
@@ -294,6 +295,7 @@ def test_objects_to_paste_are_rare_classes_of_both_benchmarks(
     taxonomy: Taxonomy, tmp_path: Path
 ) -> None:
     dataset = SimulatedStreets(tmp_path, "hdl64e" if taxonomy is SEMANTICKITTI else "hdl32e")
-    names = {taxonomy.classes[train_id - 1] for train_id in ScanSet(dataset, []).pasted}
+    scans = ScanSet(dataset, [], Expectation())
+    names = {taxonomy.classes[train_id - 1] for train_id in scans.pasted}
     assert {"bicycle", "motorcycle", "truck"} <= names
     assert not names & {"car", "road", "sidewalk", "driveable_surface", "vegetation"}

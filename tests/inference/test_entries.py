@@ -21,10 +21,11 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.evaluation.scoring import label_by_weights
 from amvnet.export.onnx import export
 from amvnet.inference.listing import list_inputs
-from amvnet.inference.reading import normalised, normaliser_for
+from amvnet.inference.reading import normalised
 from amvnet.inference.segmenter import Segmenter
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
+from amvnet.sensors.normalise import Normaliser
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import save
 from amvnet_ros.segmentation import CloudSegmenter, Settings
@@ -174,7 +175,7 @@ def by_predict(world: World, points: np.ndarray) -> np.ndarray:
 
 
 def by_view(world: World, points: np.ndarray) -> np.ndarray:
-    normaliser = normaliser_for(world.segmenter.weights)
+    normaliser = Normaliser(world.segmenter.weights.expects)
     scans, taxonomy = list_inputs([str(world.write(points))], normaliser=normaliser)
     (shown,) = show_scans(scans, taxonomy, world.segmenter)
     return shown.labels["amvnet"]
@@ -182,7 +183,7 @@ def by_view(world: World, points: np.ndarray) -> np.ndarray:
 
 def by_evaluate(world: World, points: np.ndarray) -> np.ndarray:
     dataset = open_dataset(str(world.write_own(points)))
-    return _evaluated(world, normalised(dataset, normaliser_for(world.segmenter.weights)))
+    return _evaluated(world, normalised(dataset, Normaliser(world.segmenter.weights.expects)))
 
 
 def by_node(world: World, points: np.ndarray) -> np.ndarray:

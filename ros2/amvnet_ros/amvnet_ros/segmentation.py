@@ -94,9 +94,9 @@ class CloudSegmenter:
         import torch
 
         import amvnet
-        from amvnet.inference.reading import normaliser_for
         from amvnet.runtime.memory import keep_freed_memory
         from amvnet.sensors.lidars import make_sensor
+        from amvnet.sensors.normalise import Normaliser
 
         sensor = make_sensor(**settings.sensor_options())
         if settings.threads > 0:
@@ -115,7 +115,7 @@ class CloudSegmenter:
         self.hardware = segmenter.engine.hardware
         self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
-        self._normalise = normaliser_for(segmenter.weights, sensor, report)
+        self._normalise = Normaliser(segmenter.weights.expects, sensor, report)
         self._segment = segmenter
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)
 

@@ -56,14 +56,14 @@ def adapt(
     from amvnet.data.datasets.simulated import SimulatedStreets
     from amvnet.inference.drive import find_poses
     from amvnet.inference.listing import list_inputs
-    from amvnet.inference.reading import normaliser_for
+    from amvnet.sensors.normalise import Normaliser
     from amvnet.training.adapt import adapt as adapt_weights
     from amvnet.training.adapt import recipe_for
     from amvnet.training.plan import Plan
     from amvnet.weights.file import load
 
     loaded = load(weights)
-    normaliser = normaliser_for(loaded, sensor_choice.parse(), report)
+    normaliser = Normaliser(loaded.expects, sensor_choice.parse(), report)
     scans, _ = list_inputs(inputs, choice.parse(), loaded.taxonomy, normaliser)
     recipe = recipe_for(loaded, epochs, streets, seed)
     drives = None
@@ -88,6 +88,7 @@ def adapt(
             report=report,
             bars=on_terminal(),
             also_read=(*inputs, weights, poses),
+            expects=loaded.expects,  # to which the scans are normalised
         )
 
     path = adapt_weights(
