@@ -274,7 +274,7 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
 
 POINTS = np.clip(street(5, 400)[0], [-99, -99, -99, 0], [99, 99, 99, 1]).astype(np.float32)
 RING = np.arange(len(POINTS)) % 32
-TRAINED = TrainedIntensity(tuple(np.linspace(0.1, 0.9, len(PROBABILITIES))))
+TRAINED = TrainedIntensity(tuple(np.linspace(0.1, 0.9, len(PROBABILITIES)).tolist()))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from contextlib import suppress
 import numpy as np
 
 from amvnet.config.schema import Recipe
-from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.simulated import SimulatedStreets
@@ -31,7 +30,6 @@ from amvnet.weights.file import Weights
 NETWORK_OF = {"rv": "range_net", "bev": "polar_net"}  # the network that a stage trains
 # Largest number of scans that are measured; it is enough for the mean height of simulated sensors.
 SAMPLED_SCANS = 60
-MAX_MEASURED_RECORDINGS = 20  # largest number of a user's recordings that are measured
 # Networks need no intensity if they were trained with this share of their scans without it.
 BLIND_SHARE = 0.2
 
@@ -75,26 +73,26 @@ def expected_after(
 
     first = scans.dataset.members[0]
     sampled = _sample(scans)
-    normaliser = _measuring_normaliser(first)
-    if normaliser is None:
-        known = weights.expects
-        geometry = measure_sensor(sampled)
-    else:  # the weights will get scans that are normalised in the same way
-        known = normaliser.expected or weights.expects
-        geometry = normaliser.target()
+    known = weights.expects
+    as_is = True
+    geometry = measure_sensor(sampled)
+    if isinstance(first, OwnScans) and isinstance(first.normalise, Normaliser):
+        # The weights will get scans that are normalised in the same way.
+        known = first.normalise.expected or known
+        as_is = False
+        geometry = first.normalise.target()
 
     intensity = known.intensity
     is_optional = intensity is not None and intensity.is_optional
     if isinstance(first, SimulatedStreets):
         simulated = SIMULATED_QUANTILES[first.sensor]
         intensity = TrainedIntensity(simulated, is_optional, is_matched=True)
-    elif intensity is None or not (intensity.is_matched or normaliser):
+    elif intensity is None or (as_is and not intensity.is_matched):
         quantiles = _mean_quantiles(sampled)
         if quantiles == NO_INTENSITY or are_quantiles(quantiles):
             intensity = TrainedIntensity(quantiles, is_optional)
 
     sensor = trained_sensor(recipe.sensor, geometry)
-    as_is = normaliser is None
     known = dataclasses.replace(known, sensor=sensor, intensity=intensity, as_is=as_is)
     return expected_before(known, weights.parts, recipe, stages)
 
@@ -118,12 +116,3 @@ def _mean_quantiles(scans: Sequence[Scan]) -> tuple[float, ...]:
     quantiles = [quantiles_of(scan.points[scan.valid, 3]) for scan in scans]
     known = [values for values in quantiles if values is not None]
     return tuple(np.mean(known, axis=0).round(4).tolist()) if known else ()
-
-
-def _measuring_normaliser(dataset: Dataset) -> Normaliser | None:
-    """Return the normaliser of a user's scans, which has measured them; None for other datasets."""
-    if not isinstance(dataset, OwnScans) or not isinstance(dataset.normalise, Normaliser):
-        return None
-    for source in list(dataset.recordings())[:MAX_MEASURED_RECORDINGS]:
-        dataset.normalise.measure(source)
-    return dataset.normalise

@@ -26,8 +26,10 @@ from amvnet.progress import Reporter, counted, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.normalise import Normaliser
-from amvnet.training.expectation import MAX_MEASURED_RECORDINGS, NETWORK_OF, expected_before
+from amvnet.training.expectation import NETWORK_OF, expected_before
 from amvnet.weights.file import Weights, load
+
+MAX_MEASURED_RECORDINGS = 20  # largest number of a user's recordings that are measured
 
 
 @dataclass(frozen=True)
@@ -236,7 +238,10 @@ def open_for_training(
 
 
 def _report_recordings(dataset: OwnScans, normaliser: Normaliser, report: Reporter) -> None:
-    """Report what is assumed of the first recordings, once and not in every process that reads."""
+    """Measure the first recordings, and report what is assumed of them.
+
+    The processes that read them report nothing.
+    """
     recordings = dataset.recordings()
     for source, scans in list(recordings.items())[:MAX_MEASURED_RECORDINGS]:
         with suppress(InputError):  # the check of the scans reports broken ones
