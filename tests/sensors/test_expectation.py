@@ -20,6 +20,7 @@ from amvnet.sensors.lasers import SensorGeometry, measure_sensor
 from amvnet.sensors.lidars import KNOWN_HEIGHTS, KNOWN_SENSORS, Sensor
 from amvnet.sensors.normalise import Normaliser
 from amvnet.training.expectation import expected_after
+from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.commands import fails, run_cli
@@ -45,7 +46,7 @@ def trained_at(height: float, root: Path) -> Weights:
     scans = TrainingScans(data, data.records(["08"]), ())
     weights = fresh_weights()
     recipe = Recipe(model=weights.model, sensor="hdl64e")
-    expects = expected_after(weights, scans, recipe, ("rv", "bev"))
+    expects = expected_after(Plan(recipe, scans, root, stages=("rv", "bev")), weights)
     return replace(weights, sensor="hdl64e", expects=expects)
 
 

@@ -29,6 +29,7 @@ from amvnet.sensors.lidars import Sensor, rotation_from_degrees
 from amvnet.sensors.measure import MEASURED_SCANS, Recording
 from amvnet.sensors.normalise import Normaliser
 from amvnet.training.expectation import expected_after
+from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights
 
 from fixtures.commands import fails
@@ -187,7 +188,7 @@ def measured_intensity(data: SemanticKitti, sequences: Sequence[str]) -> Trained
     """Return the intensities that networks expect which are trained on a dataset from scratch."""
     scans = TrainingScans(data, data.records(sequences), ())
     weights = without(fresh_weights(), *PARTS)
-    return expected_after(weights, scans, Recipe(), ("rv", "bev")).intensity
+    return expected_after(Plan(Recipe(), scans, data.root, stages=("rv", "bev")), weights).intensity
 
 
 def test_scans_without_intensities_have_quantiles_of_zero_and_equal_ones_are_left_out(
@@ -232,9 +233,6 @@ def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> 
     assert len(amvnet.load(raw)(wrong).labels) == len(points)
 
 
-BY_SCAN = TrainedIntensity(SIMULATED_QUANTILES["hdl64e"], is_matched=True)
-
-
 @pytest.mark.parametrize(
     "change", [lambda i: i, lambda i: i / 100, lambda i: 1 - 0.5 * (1 - i) ** 2]
 )
@@ -244,7 +242,7 @@ def test_a_matched_scan_has_the_intensities_of_the_training_in_the_same_order(
     points = scan_points()
     points[:, 3] = change(points[:, 3])
     points[7, 3] = np.nan
-    scan = match_scan(Scan(points), BY_SCAN)
+    scan = match_scan(Scan(points), SIMULATED_QUANTILES["hdl64e"])
 
     valid = scan.valid
     found = np.quantile(scan.points[valid, 3], PROBABILITIES)
@@ -259,7 +257,7 @@ def test_a_scan_without_intensity_is_not_matched() -> None:
     points = scan_points()
     points[:, 3] = 0
     scan = Scan(points)
-    assert match_scan(scan, BY_SCAN) is scan
+    assert match_scan(scan, SIMULATED_QUANTILES["hdl64e"]) is scan
 
 
 def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> None:

@@ -292,10 +292,12 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
     own = [normalised(open_dataset(str(path)), Normaliser(weights.expects)) for path in paths]
     a, b = [TrainingScans(each, each.records(each.sequences("train")), ()) for each in own]
 
-    expects = expected_after(weights, join(a, [b]), Recipe(), ("rv", "bev"))
+    def expected(scans: TrainingScans) -> Expectation:
+        return expected_after(Plan(Recipe(), scans, tmp_path, stages=("rv", "bev")), weights)
 
-    assert not expects.as_is
-    assert expects.sensor == expected_after(weights, a, Recipe(), ("rv", "bev")).sensor
+    both = expected(join(a, [b]))
+    assert not both.as_is
+    assert both.sensor == expected(a).sensor
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from typing import Any
 from amvnet.config.bounds import check_text
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import RangeViewConfig
-from amvnet.data.laser_order import with_lasers
+from amvnet.data.laser_order import lasers_by_order
 from amvnet.errors import InputError, shown
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import (
@@ -66,10 +66,13 @@ class Expectation:
         Raises:
             InputError: if more than a few intensities are out of range.
         """
-        scan = with_lasers(scan, self.view.lasers)
-        if self.intensity is None or self.intensity.are_fractions:
+        if self.view.rows == "laser" and scan.ring is None:
+            ring = lasers_by_order(scan.points, self.view.height)
+            scan = dataclasses.replace(scan, ring=ring)
+        trained = self.intensity
+        if trained is None or trained.are_fractions:
             scan = check_intensity(scan)
-        return match_scan(scan, self.intensity)
+        return match_scan(scan, trained.quantiles) if trained and trained.is_matched else scan
 
     def to_dict(self) -> dict[str, Any]:
         """Return all but the view, which files hold with the sizes of the networks, for JSON."""

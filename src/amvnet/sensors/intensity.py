@@ -85,15 +85,8 @@ class TrainedIntensity:
         return np.interp(draws, PROBABILITIES, self.quantiles).astype(np.float32)
 
 
-def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
-    """Return a scan whose intensities have the distribution of a training.
-
-    The scan is returned unchanged if the training does not need this
-    (`TrainedIntensity.is_matched`), or if its intensities are constant.
-    """
-    if trained is None or not trained.is_matched:
-        return scan
-
+def match_scan(scan: Scan, trained: Sequence[float]) -> Scan:
+    """Return a scan whose intensities have the quantiles of a training; constant ones stay."""
     valid = scan.valid
     intensity = scan.points[valid, 3]
     quantiles = quantiles_of(intensity)
@@ -101,7 +94,7 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
         return scan
 
     points = scan.points.copy()
-    levels, becomes = matching(quantiles, trained.quantiles)
+    levels, becomes = matching(quantiles, trained)
     points[valid, 3] = np.interp(intensity, levels, becomes)
     return dataclasses.replace(scan, points=points)
 

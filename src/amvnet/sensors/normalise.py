@@ -315,12 +315,12 @@ def _rows_by_laser(
     the training's lasers.
     """
     view = expected.view
-    if not view.lasers or not lasers.has_ends_of(expected.lasers):
+    if view.rows != "laser" or not lasers.has_ends_of(expected.lasers):
         return None
 
     ring = cloud.ring
     if ring is None:
-        ring = lasers_by_order(cloud.xyz, view.lasers)
+        ring = lasers_by_order(cloud.xyz, view.height)
     if ring is None or not view.has_laser_per_row(ring.max()):
         return None
     return view.height - 1 - ring

@@ -94,8 +94,7 @@ class Weights:
     @property
     def usual_uncertain(self) -> float:
         """The share of uncertain points in the validation, in [0, 1]; else `USUAL_UNCERTAIN`."""
-        metrics = self.metrics.get("point_head")
-        share = metrics.get(UNCERTAIN) if isinstance(metrics, Mapping) else None
+        share = self.metrics.get("point_head", {}).get(UNCERTAIN)
         if isinstance(share, int | float) and 0 <= share <= 1:
             return float(share)
         return USUAL_UNCERTAIN
