@@ -29,7 +29,7 @@ from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails, files, succeed
 from fixtures.exports import shallow_weights
-from fixtures.tiny import fresh_weights, street, with_intensities, without
+from fixtures.tiny import fresh_weights, street, trained_for, with_intensities, without
 
 POINTS = 3000
 QUANTISED = ("range_net", "polar_map")
@@ -185,7 +185,8 @@ def test_the_graphs_say_nothing_of_the_machine(exported: Folders) -> None:
 
 @pytest.mark.full
 def test_one_scan_and_rows_by_ring_do(scans: Path, tmp_path: Path) -> None:
-    weights = without(fresh_weights(NUSCENES), "polar_net", "point_head")
+    weights = trained_for(fresh_weights(NUSCENES), "hdl32e")
+    weights = without(weights, "polar_net", "point_head")
     path = save(weights, tmp_path / "w.safetensors")
     succeed(f"export --weights {path} --out {tmp_path}/out --int8 {scans}/000003.bin")
 

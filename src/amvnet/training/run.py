@@ -74,9 +74,9 @@ def _train_stages(plan: Plan, stage: str, init: Weights | None) -> Path:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
         _check_initial(plan, name)
     counts, taught = check_data(plan)
+    plan.processes.wait()  # until all streets of the first epoch are simulated
     expects = plan.expects or expected_after(plan, weights)
     plan = dataclasses.replace(plan, class_counts=counts, taught=taught, expects=expects)
-    plan.processes.wait()
     if plan.processes.first:
         write_record(plan, stage, init)
     keep_counts(plan, counts)

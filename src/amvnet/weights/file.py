@@ -76,6 +76,7 @@ class Weights:
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        # Whoever changes the view of the model need not think of the copy in `expects`.
         expects = dataclasses.replace(self.expects, view=self.model.range_view)
         object.__setattr__(self, "expects", expects)
 
