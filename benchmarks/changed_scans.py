@@ -26,9 +26,9 @@ import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
-from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import AXES, KNOWN_HEIGHTS, make_sensor, rotation_from_degrees
+from amvnet.sensors.normalise import Normaliser
 
 GOAL = 0.9  # least share of the accuracy on unchanged scans
 HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # height of the HDL-64E above the ground, metres
@@ -156,9 +156,8 @@ def measure(
     accuracies = []
     for scan in scans:
         cloud = change.apply(scan.points[:, :3], scan.points[:, 3])
-        normaliser = normaliser_for(
-            labeller.segmenter.weights, make_sensor(**options), reported.append
-        )
+        expects = labeller.segmenter.weights.expects
+        normaliser = Normaliser(expects, make_sensor(**options), reported.append)
         try:
             labels = labeller(normaliser(cloud, scan.name))
         except InputError as error:

@@ -120,7 +120,7 @@ def untrained(recipe: Recipe) -> Weights:
     tensors: dict[str, torch.Tensor] = {}
     for part in PARTS:
         tensors |= part_state(part, getattr(model, part).state_dict())
-    return Weights(recipe.model, taxonomy, recipe.sensor, tensors)
+    return Weights(recipe.model, taxonomy, recipe.sensor, tensors=tensors)
 
 
 def print_machine(options: Options, scan: Scan) -> None:

@@ -23,7 +23,6 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.onnx_runner import OnnxSegmenter, disagree
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import match_scan
 
 GRAPHS = ("range_net", "polar_map")
 RUNS = 15
@@ -50,7 +49,7 @@ class Runner(OnnxSegmenter):
 
     def label(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Return the labels of finite points by method, and (P,) bool: the uncertain points."""
-        scan = match_scan(scan, self.intensity)
+        scan = self.expects.prepare(scan)
         valid = scan.select(scan.valid)
         points = valid.points
         f = self.score_range_view(valid)

@@ -19,8 +19,8 @@ import amvnet
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
 from amvnet.evaluation.metrics import Evaluation
-from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
+from amvnet.sensors.normalise import Normaliser
 from lidarstreets import simulate
 from lidarstreets.sensing.sensors import LIDAR_MODELS, LidarModel
 
@@ -65,7 +65,7 @@ OTHERS = {
 def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
     """Print mIoU over the classes present and accuracy of AMVNet, unchanged and normalised."""
     dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
-    normalise = normaliser_for(segmenter.weights)
+    normalise = Normaliser(segmenter.weights.expects)
     unchanged = Evaluation(dataset.taxonomy)
     normalised = Evaluation(dataset.taxonomy)
 

@@ -39,8 +39,8 @@ async function label({ id, file, folder, isPreview }) {
 
   const description = await readDescription(folder);
   const cloud = await step("read", async () => readCloud(await bytesOf(file), file.name));
-  const { range_view: view, normalise: { sensor, intensity, as_is: isAsIs } } = description;
-  const scan = await step("normalise", () => normalise(cloud, { view, sensor, intensity, isAsIs }));
+  const expected = { view: description.range_view, ...description.expects };
+  const scan = await step("normalise", () => normalise(cloud, expected));
   send("shown", { text: scan.text, ...shownScan(file.name, scan, null, description) });
   if (isPreview) return;
 

@@ -19,15 +19,14 @@ from numpy.typing import NDArray
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
-from amvnet.data.laser_order import with_lasers
-from amvnet.errors import InputError, reason_of
+from amvnet.errors import InputError, errors_of, reason_of
 from amvnet.models.neighbours import nearest_others
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
-from amvnet.sensors.intensity import TrainedIntensity, check_intensity, check_quantiles, match_scan
+from amvnet.sensors.expectation import Expectation
 
 DESCRIPTION = "amvnet.json"  # name of the file that describes the graphs in its folder
 LONGEST_NAME = 200  # longest file name of a graph, characters
-FORMAT = 2  # version of the description
+FORMAT = 3  # version of the description
 POLAR_GRAPHS = ("polar_points", "polar_pillars", "polar_map", "polar_scores")
 # The graphs that each method needs.
 GRAPHS_BY_METHOD = {
@@ -80,8 +79,6 @@ class OnnxSegmenter:
 
         self.description = description
         self.method: str = description["method"]
-        self.intensity = _read_intensity(folder, description)
-        self.are_fractions = _takes_fractions(description)
         self.range_view = from_dict(RangeViewConfig, description.get("range_view", {}), source)
         self.polar_view = from_dict(PolarViewConfig, description.get("polar_view", {}), source)
         assertion = description.get("assertion", {})
@@ -89,6 +86,8 @@ class OnnxSegmenter:
             assertion = {key: value for key, value in assertion.items() if key != "name"}
         self.assertion = from_dict(AssertionConfig, assertion, source)
         self.head = from_dict(PointHeadConfig, description.get("point_head", {}), source)
+        with errors_of(source):
+            self.expects = Expectation.from_dict(description.get("expects"), self.range_view)
 
         self._graphs: dict[str, Any] = {}
         for name in GRAPHS_BY_METHOD[self.method]:
@@ -114,13 +113,7 @@ class OnnxSegmenter:
             with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: not valid
                 table = as_array(points, "points of shape (N, 4)").astype(np.float32)
             scan = Scan(table, ring=ring)
-        check_scan(scan)
-
-        if scan.row is None:
-            scan = with_lasers(scan, self.range_view.lasers)
-        if self.are_fractions:
-            scan = check_intensity(scan)
-        scan = match_scan(scan, self.intensity)
+        scan = self.expects.prepare(check_scan(scan))
 
         valid = scan.valid
         scores, uncertain = self._scores(scan.select(valid))
@@ -219,22 +212,6 @@ class OnnxSegmenter:
         for entry, values in zip(self.description["graphs"][name]["inputs"], inputs, strict=True):
             feed[entry["name"]] = values
         return np.asarray(self._graphs[name].run(None, feed)[0])
-
-
-def _read_intensity(folder: Path, description: Mapping[str, Any]) -> TrainedIntensity | None:
-    """Return the distribution to which intensities are matched, or None to leave them unchanged."""
-    values = description.get("intensity")
-    if values is None:
-        return None
-
-    quantiles = values.get("quantiles") if isinstance(values, Mapping) else None
-    return TrainedIntensity(check_quantiles(quantiles, str(folder)), is_matched=True)
-
-
-def _takes_fractions(description: Mapping[str, Any]) -> bool:
-    """Return whether the graphs take intensities in [0, 1], as most weights do."""
-    points = description.get("points")
-    return not isinstance(points, Mapping) or points.get("intensity", "missing") is not None
 
 
 def range_image(view: RangeViewConfig, scan: Scan) -> tuple[np.ndarray, np.ndarray]:

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amvnet.data.laser_order import lasers_by_order, with_lasers
+from amvnet.config.schema import RangeViewConfig
+from amvnet.data.laser_order import lasers_by_order
 from amvnet.scan import Scan
+from amvnet.sensors.expectation import Expectation
 
 LASERS = 16
 SHOTS = 200
@@ -77,9 +79,10 @@ def test_turns_that_do_not_keep_to_an_elevation_are_no_lasers() -> None:
 def test_known_rings_stay() -> None:
     points, ring = turns()
     others = np.zeros_like(ring)
-    assert with_lasers(Scan(points, ring=others), LASERS).ring is others
-    assert with_lasers(Scan(points), 0).ring is None
-    found = with_lasers(Scan(points), LASERS).ring
+    expects = Expectation(RangeViewConfig(rows="laser", height=LASERS))
+    assert expects.prepare(Scan(points, ring=others)).ring is others
+    assert Expectation().prepare(Scan(points)).ring is None
+    found = expects.prepare(Scan(points)).ring
     assert found is not None
     assert np.array_equal(found, ring)
 

@@ -6,6 +6,7 @@ import os
 import pickle
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.datasets.select import split_records
 from amvnet.data.datasets.simulated import SimulatedStreets
-from amvnet.data.laser_order import with_lasers
+from amvnet.data.laser_order import lasers_by_order
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.sensors.expectation import Expectation
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, drive_street, simulate, writing
 
@@ -74,7 +76,7 @@ def test_a_scan_equals_that_of_the_files_of_a_simulation(
             if not is_real:
                 continue
             # The order of the points in the files of SemanticKITTI tells their rings.
-            other = with_lasers(other, 64)
+            other = replace(other, ring=lasers_by_order(other.points, 64))
         assert scan.ring is not None
         assert other.ring is not None
         assert np.array_equal(scan.ring, other.ring)
@@ -266,7 +268,7 @@ def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
 ) -> None:
     dataset = SimulatedStreets(tmp_path)
     config = AugmentConfig(mix=0.5, laser_mix=0.5, paste=0.5)
-    scans = ScanSet(dataset, dataset.records(["0", "1"]), config)
+    scans = ScanSet(dataset, dataset.records(["0", "1"]), Expectation(), config)
     loader = make_loader(scans, batch=3, workers=workers, shuffle=True)
     for epoch in (0, 1):
         loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
@@ -285,7 +287,7 @@ def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
 
 def test_validation_has_the_same_streets_in_every_epoch(tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path)
-    scans = ScanSet(dataset, dataset.records(["7"]))
+    scans = ScanSet(dataset, dataset.records(["7"]), Expectation())
     assert scans[4, 2].name == scans[0, 2].name == "000007/000002"
 
 
@@ -294,6 +296,7 @@ def test_objects_to_paste_are_rare_classes_of_both_benchmarks(
     taxonomy: Taxonomy, tmp_path: Path
 ) -> None:
     dataset = SimulatedStreets(tmp_path, "hdl64e" if taxonomy is SEMANTICKITTI else "hdl32e")
-    names = {taxonomy.classes[train_id - 1] for train_id in ScanSet(dataset, []).pasted}
+    scans = ScanSet(dataset, [], Expectation())
+    names = {taxonomy.classes[train_id - 1] for train_id in scans.pasted}
     assert {"bicycle", "motorcycle", "truck"} <= names
     assert not names & {"car", "road", "sidewalk", "driveable_surface", "vegetation"}

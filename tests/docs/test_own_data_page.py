@@ -64,9 +64,9 @@ def test_every_command_of_the_page_runs(
         np.testing.assert_array_equal(of_dataset, of_folder)
 
     # The sensor of the training scans is kept: +-15 degrees, brought to the height of the recipe.
-    sensor = load("runs/new").training["range_net"]["sensor"]
-    assert (sensor["fov_up"], sensor["fov_down"]) == pytest.approx((15, -15), abs=2)
-    assert sensor["height"] == 1.73 != LIDAR_MODELS["vlp16"].height
+    sensor = load("runs/new").expects.sensor
+    assert (sensor.fov_up, sensor.fov_down) == pytest.approx((15, -15), abs=2)
+    assert sensor.height == 1.73 != LIDAR_MODELS["vlp16"].height
     assert "site_d" in Path("next.csv").read_text()
     assert Path("runs/new/curves.png").read_bytes().startswith(b"\x89PNG")
 

@@ -48,8 +48,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_pcd(folder / "cloud.pcd", points * np.array([1, 1, 1, 255], np.float32), "binary")
     write_bag1(folder / "drive.bag", {"/lidar/top": [points], "/lidar/side": [points]})
     (folder / "robot.yaml").write_text(SENSOR.blocks("yaml")[0])
-    records = load("sim-hdl64e").training
-    save(replace(fresh_weights(), training=records, sensor="hdl64e"), folder / "tiny.safetensors")
+    expects = load("sim-hdl64e").expects
+    save(replace(fresh_weights(), expects=expects, sensor="hdl64e"), folder / "tiny.safetensors")
     return folder
 
 

@@ -21,8 +21,6 @@ from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.errors import InputError
-from amvnet.export.onnx import describe_expectation
-from amvnet.inference.reading import expectation_of
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import (
     distances,
@@ -32,7 +30,8 @@ from amvnet.onnx_runner import (
     scores_of_points,
 )
 from amvnet.scan import Scan
-from amvnet.sensors.normalise import Expectation, Normaliser
+from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import load
 
 from fixtures.marks import with_quick
@@ -49,13 +48,9 @@ NEIGHBOURS = 15
 K = 3  # number of classes whose scores are made up
 FLOATS = (".points", ".image", ".features", ".scores")  # the arrays of float32; others are int32
 
+load_once = cache(load)
+
 pytestmark = pytest.mark.skipif(NODE is None, reason="Node.js is not installed")
-
-
-@cache
-def expectation(weights: str) -> Expectation:
-    """Return what built-in weights expect of a scan."""
-    return expectation_of(load(weights))
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ class Case:
 
     @property
     def expected(self) -> Expectation:
-        expected = expectation(self.weights)
+        expected = load_once(self.weights).expects
         view = expected.view
         rows = self.rows or view.rows
         # Coarse images have hidden points.
@@ -80,19 +75,13 @@ def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
     """Return what the page's modules make of scans: {text, points, rows, ...} or {error}."""
     jobs = []
     for index, case in enumerate(cases):
-        expected = describe_expectation(case.expected)
         job = {
             "file": str(case.file),
             "out": str(folder / str(index)),
             "polarView": to_dict(POLAR),
             "own": list(range(0, 30_000, 97)),
             "n": NEIGHBOURS,
-            "expected": {
-                "view": to_dict(case.expected.view),
-                "sensor": expected["sensor"],
-                "intensity": expected["intensity"],
-                "isAsIs": expected["as_is"],
-            },
+            "expected": {"view": to_dict(case.expected.view), **case.expected.to_dict()},
         }
         jobs.append(job)
     listing = folder / "jobs.json"

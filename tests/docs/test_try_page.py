@@ -25,7 +25,6 @@ from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.export.onnx import export
-from amvnet.inference.reading import expectation_of
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import load, save
@@ -235,7 +234,7 @@ def plain(
 def reference(path: Path, weights: str | Path, graphs: Path) -> np.ndarray:
     """Return the raw ids by `onnx_runner.py` of a scan that is normalised as in `predict`."""
     loaded = load(weights)
-    normaliser = Normaliser(expectation_of(loaded))
+    normaliser = Normaliser(loaded.expects)
     cloud = read_file(path, ending_of(path), UNKNOWN)
     normaliser.expect("scans", lambda: cloud)
     scan = normaliser(cloud, "scans")

@@ -13,7 +13,6 @@ from torch.nn import functional as F
 
 import amvnet
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.laser_order import with_lasers
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.engines.base import build_model
 from amvnet.engines.torch import TorchEngine
@@ -25,7 +24,6 @@ from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.weights.file import Weights
 from lidarstreets import simulate
 
@@ -67,9 +65,7 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
     its voxel among all voxels, and SciPy finds the neighbours.
     """
     model = weights.build()
-    intensity = trained_intensity(weights.training, weights.sensor)
-    scan = with_lasers(scan, weights.model.range_view.lasers)
-    batch = PointBatch.of([match_scan(scan, intensity)])
+    batch = PointBatch.of([weights.expects.prepare(scan)])
     f = model.score_range(model.range_view.project(batch))
 
     net = model.polar_net

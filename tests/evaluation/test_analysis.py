@@ -26,7 +26,7 @@ from amvnet.inference.timing import run_once
 from amvnet.models.methods import arithmetic_mean, maximum
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import Processes
-from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY
+from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save
 
@@ -35,6 +35,7 @@ from fixtures.tiny import (
     fresh_weights,
     make_streets,
     street,
+    with_intensities,
     write_recipe,
     write_scan,
 )
@@ -154,12 +155,8 @@ def test_a_tau_above_those_that_are_swept_is_analyzed(
 
 def with_matched_intensities(weights: Weights) -> Weights:
     """Return weights that bring each scan's intensities to others, as simulated ones do."""
-    matched = {
-        MATCHED_KEY: True,
-        QUANTILES_KEY: (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist(),
-    }
-    records = {part: {**record, **matched} for part, record in weights.training.items()}
-    return replace(weights, training=records)
+    quantiles = (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist()
+    return with_intensities(weights, quantiles, is_matched=True)
 
 
 def test_a_scan_is_timed_as_it_is_segmented(dataset: Dataset, weights: Weights) -> None:

@@ -10,7 +10,7 @@ import json
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,12 +24,12 @@ from amvnet.export import onnx as onnx_export
 from amvnet.export.int8 import calibration_scans
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY
+from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails, files, succeed
 from fixtures.exports import shallow_weights
-from fixtures.tiny import fresh_weights, street, without
+from fixtures.tiny import fresh_weights, street, trained_for, with_intensities, without
 
 POINTS = 3000
 QUANTISED = ("range_net", "polar_map")
@@ -185,7 +185,8 @@ def test_the_graphs_say_nothing_of_the_machine(exported: Folders) -> None:
 
 @pytest.mark.full
 def test_one_scan_and_rows_by_ring_do(scans: Path, tmp_path: Path) -> None:
-    weights = replace(without(fresh_weights(NUSCENES), "polar_net", "point_head"), sensor="hdl32e")
+    weights = trained_for(fresh_weights(NUSCENES), "hdl32e")
+    weights = without(weights, "polar_net", "point_head")
     path = save(weights, tmp_path / "w.safetensors")
     succeed(f"export --weights {path} --out {tmp_path}/out --int8 {scans}/000003.bin")
 
@@ -211,8 +212,7 @@ def test_calibrating_without_a_folder_is_one_line(weights: Weights, tmp_path: Pa
 
 def test_calibrating_scans_have_the_intensities_that_the_networks_get(scans: Path) -> None:
     quantiles = (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist()
-    record = {MATCHED_KEY: True, QUANTILES_KEY: quantiles}
-    weights = replace(fresh_weights(), training={"range_net": record, "polar_net": record})
+    weights = with_intensities(fresh_weights(), quantiles, is_matched=True)
     for scan in calibration_scans(str(scans), weights):
         found = np.quantile(scan.points[scan.valid, 3], PROBABILITIES)
         np.testing.assert_allclose(found, quantiles, atol=0.02)

@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +27,12 @@ import amvnet
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.export import onnx as onnx_export
 from amvnet.export.onnx import describe_export
-from amvnet.models.methods import BOTH_NETWORKS, MethodName
+from amvnet.models.methods import MethodName
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import DESCRIPTION, OnnxSegmenter, pool
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import (
-    MATCHED_KEY,
-    PROBABILITIES,
-    QUANTILES_KEY,
     SIMULATED_QUANTILES,
-    trained_intensity,
 )
 from amvnet.weights.file import Weights, save
 
@@ -50,7 +46,7 @@ from fixtures.commands import (
 from fixtures.examples import first_of
 from fixtures.exports import shallow_weights
 from fixtures.pages import DocsPage
-from fixtures.tiny import fresh_weights, street, without
+from fixtures.tiny import fresh_weights, street, with_intensities, without
 
 PROJECT = Path(__file__).parents[2]
 POINTS = 6000
@@ -164,15 +160,11 @@ def test_other_methods_say_what_torch_says(
 
 def test_matched_intensities_are_in_the_description(exported: Exports, folder: Path) -> None:
     quantiles = SIMULATED_QUANTILES["hdl64e"]
-    records = {part: {MATCHED_KEY: True, QUANTILES_KEY: list(quantiles)} for part in BOTH_NETWORKS}
-    weights = replace(exported["shallow"].weights, training=records)
+    weights = with_intensities(exported["shallow"].weights, quantiles, is_matched=True)
     description = describe_export(weights, "amvnet", read_description(folder)["graphs"])
-    assert description["intensity"] == {
-        "probabilities": list(PROBABILITIES),
-        "quantiles": list(quantiles),
-    }
+    assert description["expects"]["intensity"]["quantiles"] == list(quantiles)
 
-    change(folder, "intensity", to=description["intensity"])
+    change(folder, "expects", to=description["expects"])
     scan = make_scan(3)
     expected = amvnet.load(weights)(scan)
     actual = OnnxSegmenter(folder)(scan.points)
@@ -279,12 +271,6 @@ def test_the_graphs_say_nothing_of_the_machine(exported: Exports) -> None:
         data = path.read_bytes()
         for word in (str(PROJECT), sys.prefix, "site-packages"):
             assert word.encode() not in data, path.name
-
-
-def test_intensities_that_are_not_matched_are_not_in_the_description() -> None:
-    weights = replace(fresh_weights(), sensor="hdl64e")
-    assert trained_intensity(weights.training, weights.sensor) is not None
-    assert describe_export(weights, "amvnet", {})["intensity"] is None
 
 
 # ---- the runner

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,27 @@ import torch
 from rosbags.typesys import Stores, get_typestore
 
 import amvnet
+from amvnet import onnx_runner
+from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.evaluation.scoring import label_by_weights
-from amvnet.export.onnx import export
+from amvnet.export.int8 import calibration_scans
+from amvnet.export.onnx import describe_export, export
+from amvnet.inference.fuse import Fusion
 from amvnet.inference.listing import list_inputs
-from amvnet.inference.reading import normalised, normaliser_for
+from amvnet.inference.reading import normalised
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.amvnet import LateFusion
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.range_view import RangeView
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
+from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
+from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.normalise import Normaliser
+from amvnet.training.loaders import ScanSet, collate
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import save
 from amvnet_ros.segmentation import CloudSegmenter, Settings
@@ -32,6 +45,7 @@ from amvnet_ros.segmentation import CloudSegmenter, Settings
 from fixtures.commands import fails, succeed
 from fixtures.marks import with_full, with_quick
 from fixtures.scan_writers import cloud_message
+from fixtures.sensors import LASERS, place
 from fixtures.tiny import (
     fresh_weights,
     street,
@@ -174,7 +188,7 @@ def by_predict(world: World, points: np.ndarray) -> np.ndarray:
 
 
 def by_view(world: World, points: np.ndarray) -> np.ndarray:
-    normaliser = normaliser_for(world.segmenter.weights)
+    normaliser = Normaliser(world.segmenter.weights.expects)
     scans, taxonomy = list_inputs([str(world.write(points))], normaliser=normaliser)
     (shown,) = show_scans(scans, taxonomy, world.segmenter)
     return shown.labels["amvnet"]
@@ -182,7 +196,7 @@ def by_view(world: World, points: np.ndarray) -> np.ndarray:
 
 def by_evaluate(world: World, points: np.ndarray) -> np.ndarray:
     dataset = open_dataset(str(world.write_own(points)))
-    return _evaluated(world, normalised(dataset, normaliser_for(world.segmenter.weights)))
+    return _evaluated(world, normalised(dataset, Normaliser(world.segmenter.weights.expects)))
 
 
 def by_node(world: World, points: np.ndarray) -> np.ndarray:
@@ -279,6 +293,156 @@ def test_the_onnx_runner_gives_a_scan_the_same_labels(runner: OnnxSegmenter, nam
     np.testing.assert_array_equal(labels == 0, is_lost(points))
     expected = amvnet.load(WEIGHTS, method="rv")(points).labels
     assert (labels == expected).mean() > 0.995
+
+
+# What the networks get: weights whose rows are lasers, and whose intensities are matched.
+
+LASERS_VIEW = RangeViewConfig(rows="laser", height=16, width=64)  # rows by elevation differ
+QUANTILES = tuple((np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist())
+EXPECTS = Expectation(
+    sensor=Sensor(beams=16, fov_up=15.0, fov_down=-15.0, height=1.73),
+    intensity=TrainedIntensity(QUANTILES, is_optional=True, is_matched=True),
+    as_is=True,
+)
+BY_LASER = replace(WEIGHTS, model=replace(WEIGHTS.model, range_view=LASERS_VIEW), expects=EXPECTS)
+Seen = tuple[np.ndarray, np.ndarray]  # the valid points (P, 4) of a scan, and their rows (P,)
+
+
+def in_order() -> np.ndarray:
+    """Return a scan without rings, in the order of KITTI's files: laser by laser."""
+    points, laser = place(LASERS["vlp16"], 1.73)
+    turn = np.mod(np.arctan2(points[:, 1], points[:, 0]), 2 * np.pi)
+    return points[np.lexsort([turn, -laser])]
+
+
+def shuffled() -> np.ndarray:
+    return np.random.default_rng(0).permutation(in_order())
+
+
+def with_lost_returns() -> np.ndarray:
+    points = in_order()
+    points[::50, :3] = 0
+    points[7::90, 3] = np.nan
+    return points
+
+
+def dark() -> np.ndarray:
+    return in_order() ** [1, 1, 1, 3] * np.array([1, 1, 1, 0.3], np.float32)
+
+
+def a_little_too_bright() -> np.ndarray:
+    points = in_order()
+    points[700, 3] = 1.0001
+    return points
+
+
+def black() -> np.ndarray:
+    return in_order() * np.array([1, 1, 1, 0], np.float32)
+
+
+ODD = (in_order, shuffled, with_lost_returns, dark, a_little_too_bright, black)
+
+
+@contextmanager
+def watched() -> Iterator[list[Seen]]:
+    """Record the points and rows of the last scan in each batch that the range view gets."""
+    seen: list[Seen] = []
+    project = RangeView.project
+    fuse = LateFusion.fuse
+    image = onnx_runner.range_image
+
+    def record(batch: PointBatch) -> None:
+        (part,) = batch.slices()[-1:]
+        rows = RangeView(LASERS_VIEW).rows(batch)
+        seen.append((batch.points[part].numpy().copy(), rows[part].numpy().copy()))
+
+    def watch_project(view: RangeView, batch: PointBatch) -> Any:
+        record(batch)
+        return project(view, batch)
+
+    def watch_fuse(model: LateFusion, batch: PointBatch, *scores: torch.Tensor) -> Any:
+        record(batch)
+        return fuse(model, batch, *scores)
+
+    def watch_image(view: RangeViewConfig, scan: Scan) -> Any:
+        seen.append((scan.points, onnx_runner.image_rows(view, scan)))
+        return image(view, scan)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RangeView, "project", watch_project)
+        patch.setattr(LateFusion, "fuse", watch_fuse)
+        patch.setattr(onnx_runner, "range_image", watch_image)
+        yield seen
+
+
+def by_fuse(world: World, points: np.ndarray) -> None:
+    scores = np.full((len(points), SEMANTICKITTI.size), 1 / SEMANTICKITTI.size)
+    Fusion(BY_LASER)(points, scores, scores)
+
+
+def by_training(world: World, points: np.ndarray) -> None:
+    dataset = open_dataset(str(world.write_kitti(points)))
+    scans = ScanSet(dataset, dataset.records(["08"]), BY_LASER.expects)
+    batch, _, _ = collate([scans[0, 0]])
+    RangeView(LASERS_VIEW).project(batch)
+
+
+def by_calibration(world: World, points: np.ndarray) -> None:
+    for path in (world.write(points), world.write_kitti(points)):
+        (scan,) = calibration_scans(str(path), BY_LASER)
+        onnx_runner.range_image(LASERS_VIEW, scan.select(scan.valid))
+
+
+@pytest.fixture(scope="module")
+def by_laser(tmp_path_factory: pytest.TempPathFactory) -> World:
+    folder = tmp_path_factory.mktemp("by_laser")
+    return World(folder, save(BY_LASER, folder / "tiny.safetensors"))
+
+
+class BlindRunner(OnnxSegmenter):
+    """The ONNX runner of an export whose graphs see nothing, so that none has to be exported."""
+
+    def _check_sizes(self, folder: Path, k: int) -> None:
+        pass
+
+    def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
+        _, _, height, width = inputs[0].shape
+        return np.zeros((1, SEMANTICKITTI.size, height, width), np.float32)
+
+
+def by_runner(world: World, points: np.ndarray) -> None:
+    graphs = {"range_net": {"file": "range_net.onnx", "inputs": []}}
+    description = describe_export(BY_LASER, "rv", graphs)
+    (world.folder / onnx_runner.DESCRIPTION).write_text(json.dumps(description))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(onnx_runner, "_open_graph", lambda *_: None)
+        runner = BlindRunner(world.folder)
+    runner(points)
+
+
+@pytest.mark.parametrize("make", with_quick(ODD, (shuffled, with_lost_returns)))
+def test_every_entry_gives_the_networks_the_same_points_and_rows(
+    by_laser: World, make: Callable[[], np.ndarray]
+) -> None:
+    points = make()
+    with watched() as seen:
+        expected = by_list(by_laser, points)
+    expected_points, expected_rows = seen[-1]
+    valid = Scan(points).valid
+    np.testing.assert_array_equal(expected_points[:, :3], points[valid, :3])
+    if make is not black:
+        found = np.quantile(expected_points[:, 3], PROBABILITIES)
+        np.testing.assert_allclose(found, QUANTILES, atol=0.02)
+
+    alone = (by_runner, by_fuse, by_training, by_calibration)
+    for entry in (*IN_MEMORY, *OF_FILES, *OF_DATASETS, *alone):
+        with watched() as seen:
+            labels = entry(by_laser, points)
+        seen_points, seen_rows = seen[-1]
+        np.testing.assert_array_equal(seen_rows, expected_rows, entry.__name__)
+        np.testing.assert_allclose(seen_points, expected_points, atol=1e-6, err_msg=entry.__name__)
+        if labels is not None:
+            assert (labels == expected).mean() > 0.995, entry.__name__
 
 
 OF_8_BITS = ("intensities in [0, 1]", "to 255", "divide")

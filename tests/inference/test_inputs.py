@@ -22,7 +22,7 @@ from amvnet.inference import reading
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.predict import ADVICE, report_certainty
-from amvnet.inference.reading import array_scan, normaliser_for
+from amvnet.inference.reading import array_scan
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.lidars import Sensor
@@ -60,7 +60,7 @@ def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]
     """Return the normalised scans of a folder, the titles of their sensors, and what was said."""
     lines: list[str] = []
     inputs, _ = list_inputs(
-        [str(folder)], normaliser=normaliser_for(weights_for(), report=lines.append)
+        [str(folder)], normaliser=Normaliser(weights_for().expects, report=lines.append)
     )
     scans = {scan.name: scan.load().scan for scan in inputs}
     return scans, {scan.name: scan.source for scan in inputs}, lines
@@ -112,7 +112,7 @@ def test_a_sensor_in_the_yaml_file_counts_unless_the_command_describes_one(tmp_p
 
     for described, expected in ((None, 1.5), (Sensor(height=2.0), 2.0)):
         dataset = reading.normalised(
-            open_dataset(str(path)), normaliser_for(weights_for(), described)
+            open_dataset(str(path)), Normaliser(weights_for().expects, described)
         )
         assert isinstance(dataset, OwnScans)
         assert isinstance(dataset.normalise, Normaliser)
@@ -181,7 +181,7 @@ def test_recordings_of_a_run_are_judged_on_the_command_line(
     for name, table in points.items():
         (tmp_path / name).mkdir()
         table.tofile(tmp_path / name / f"{name}.bin")
-        scan = normaliser_for(weights)(Cloud(table[:, :3], table[:, 3], name=name), name)
+        scan = Normaliser(weights.expects)(Cloud(table[:, :3], table[:, 3], name=name), name)
         result = amvnet.load(weights)(scan)
         shares[name] = f"{result.uncertain.mean():.1%}"
 
@@ -255,7 +255,7 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
     points = points[laser % 4 == 0]
     np.save(tmp_path / "a.npy", points)
 
-    scan = normaliser_for(weights)(Cloud(points[:, :3], points[:, 3], name="a"), "a")
+    scan = Normaliser(weights.expects)(Cloud(points[:, :3], points[:, 3], name="a"), "a")
     expected = segmenter(scan).labels
     assert np.mean(segmenter(replace(scan, row=None)).labels != expected) > 0.02
 
@@ -264,7 +264,7 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
     raw = np.fromfile(tmp_path / "a.label", np.uint32)
     np.testing.assert_array_equal(raw, weights.taxonomy.to_raw(expected))
 
-    scans, taxonomy = list_inputs([f"{tmp_path}/a.npy"], normaliser=normaliser_for(weights))
+    scans, taxonomy = list_inputs([f"{tmp_path}/a.npy"], normaliser=Normaliser(weights.expects))
     (shown,) = show_scans(scans, taxonomy, segmenter)
     np.testing.assert_array_equal(shown.labels["amvnet"], expected)
     np.testing.assert_array_equal(segmenter(tmp_path / "a.npy").labels, expected)
@@ -274,7 +274,7 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
 
 POINTS = np.clip(street(5, 400)[0], [-99, -99, -99, 0], [99, 99, 99, 1]).astype(np.float32)
 RING = np.arange(len(POINTS)) % 32
-TRAINED = TrainedIntensity(np.linspace(0.1, 0.9, len(PROBABILITIES)).tolist())
+TRAINED = TrainedIntensity(tuple(np.linspace(0.1, 0.9, len(PROBABILITIES)).tolist()))
 
 
 @pytest.mark.parametrize(

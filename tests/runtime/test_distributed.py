@@ -18,6 +18,7 @@ from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.runtime.distributed import Processes
+from amvnet.sensors.expectation import Expectation
 from amvnet.training.loaders import EpochSampler, ScanSet, make_loader
 from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.weights.file import Weights, load
@@ -234,7 +235,7 @@ def test_the_processes_parts_of_the_batches_make_up_those_of_one_process(
 def test_processes_validate_every_scan_once(size: int, count: int) -> None:
     dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
     records: Any = [None] * size
-    scans = ScanSet(dataset, records)
+    scans = ScanSet(dataset, records, Expectation())
     keys: list[tuple[int, int]] = []
     for rank in range(count):
         loader = make_loader(scans, 1, 0, shuffle=False, processes=Processes(rank, count))

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from amvnet.data.formats.cloud import Cloud
-from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.frame import Frame, find_frame
 from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
+from amvnet.sensors.normalise import Normaliser
 
 from fixtures.commands import fails
 from fixtures.examples import first_of
 from fixtures.sensors import LASERS, place
-from fixtures.tiny import fresh_weights
+from fixtures.tiny import fresh_weights, trained_for
 
 UP = ["z-down", "z-forward", "y-up"]
-WEIGHTS = replace(fresh_weights(), sensor="hdl64e")
+WEIGHTS = trained_for(fresh_weights(), "hdl64e")
 
 
 def scan_xyz(height: float = 1.73, seed: int = 0) -> np.ndarray:
@@ -41,7 +40,7 @@ def normalise(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]
     """Return the normalised scan, and what was said."""
     lines: list[str] = []
     intensity = np.linspace(0, 0.6, len(xyz))
-    scan = normaliser_for(WEIGHTS, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")
+    scan = Normaliser(WEIGHTS.expects, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")
     return scan, lines[0]
 
 
@@ -157,7 +156,7 @@ def test_a_raised_road_is_not_upside_down() -> None:
 
 @pytest.mark.parametrize("tilt", first_of([(8, 0), (0, 8)]))
 def test_scans_that_sway_are_levelled_one_by_one(tilt: tuple[float, float]) -> None:
-    normaliser = normaliser_for(WEIGHTS)
+    normaliser = Normaliser(WEIGHTS.expects)
     pitch, roll = tilt
     for seed, side in enumerate((1, -1, 1, -1, 1, -1, 1)):
         xyz = scan_xyz(seed=seed)

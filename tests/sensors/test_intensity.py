@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,24 +12,25 @@ import numpy as np
 import pytest
 
 import amvnet
+from amvnet.config.schema import RangeViewConfig, Recipe
+from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
-from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
+from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import (
-    MATCHED_KEY,
     PROBABILITIES,
-    QUANTILES_KEY,
     SIMULATED_QUANTILES,
     TrainedIntensity,
     match_scan,
     matching,
-    trained_intensity,
 )
 from amvnet.sensors.lidars import Sensor, rotation_from_degrees
 from amvnet.sensors.measure import MEASURED_SCANS, Recording
-from amvnet.training.sensor_record import sensor_record
-from amvnet.weights.file import Weights
+from amvnet.sensors.normalise import Normaliser
+from amvnet.training.expectation import expected_after
+from amvnet.training.plan import Plan
+from amvnet.weights.file import PARTS, Weights
 
 from fixtures.commands import fails
 from fixtures.sensors import LASERS, ground_height, place
@@ -37,6 +38,9 @@ from fixtures.tiny import (
     fresh_weights,
     make_streets,
     street,
+    trained_for,
+    with_intensities,
+    without,
     write_scan,
 )
 
@@ -51,16 +55,18 @@ def scan_points(height: float = 1.73, seed: int = 0) -> np.ndarray:
     return points
 
 
-def weights_with(training: dict[str, Any]) -> Weights:
-    return replace(fresh_weights(), sensor="hdl64e", training=training)
+def weights_with(**how: bool) -> Weights:
+    """Return weights that were trained with the intensities of simulated scans."""
+    weights = trained_for(fresh_weights(), "hdl64e")
+    return with_intensities(weights, SIMULATED_QUANTILES["hdl64e"], **how)
 
 
 def normalise(
-    clouds: list[Cloud], sensor: Sensor | None = None, training: dict[str, Any] | None = None
+    clouds: list[Cloud], sensor: Sensor | None = None, **how: bool
 ) -> tuple[list[Scan], list[str]]:
     """Return the normalised scans of one source, and what was said."""
     lines: list[str] = []
-    normaliser = normaliser_for(weights_with(training or {}), sensor, lines.append)
+    normaliser = Normaliser(weights_with(**how).expects, sensor, lines.append)
     return [normaliser(cloud, "a") for cloud in clouds], lines
 
 
@@ -122,32 +128,22 @@ def test_a_scale_that_the_user_gives_is_all_that_is_done() -> None:
 
 
 @pytest.mark.parametrize("intensity", [None, 0.0, 0.15, 255, np.nan])
-@pytest.mark.parametrize("share", [0.1, 0.25])
+@pytest.mark.parametrize("is_optional", [False, True])
 def test_missing_intensities_are_filled_in_as_the_weights_need_it(
-    intensity: float | None, share: float
+    intensity: float | None, is_optional: bool
 ) -> None:
     xyz = scan_points()[:, :3]
     values = None if intensity is None else np.full(len(xyz), intensity)
-    record = {"augment": {"no_intensity": share}}
-    training = {"range_net": record, "polar_net": record}
 
-    (scan, again), lines = normalise([Cloud(xyz, values, name="a")] * 2, training=training)
+    clouds = [Cloud(xyz, values, name="a")] * 2
+    (scan, again), lines = normalise(clouds, is_optional=is_optional)
     assert scan.valid.all()
     np.testing.assert_array_equal(scan.points, again.points)
-    if share >= 0.2:
+    if is_optional:
         assert (scan.points[:, 3] == 0).all()
     else:
         assert quantile_gap(scan.points[:, 3]) < 0.02
         assert "much worse" in lines[0]
-
-
-def test_intensities_are_optional_if_both_networks_have_learnt_to_do_without_them() -> None:
-    for shares, expected in (((0.25, 0.25), True), ((0.25, 0.1), False), ((0.0, 0.25), False)):
-        parts = zip(("range_net", "polar_net"), shares, strict=True)
-        training = {part: {"augment": {"no_intensity": share}} for part, share in parts}
-        trained = trained_intensity(training, "hdl64e")
-        assert trained is not None
-        assert trained.is_optional == expected
 
 
 def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
@@ -157,7 +153,7 @@ def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
         clouds.append(Cloud(points[:, :3], scale * points[:, 3], name=f"scan {seed}"))
 
     lines: list[str] = []
-    normaliser = normaliser_for(weights_with({}), report=lines.append)
+    normaliser = Normaliser(weights_with().expects, report=lines.append)
     for cloud in clouds:
         normaliser.expect("a", partial(replace, cloud))
     for cloud in clouds:
@@ -168,15 +164,6 @@ def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
         assert ground_height(scan.points) == pytest.approx(1.73, abs=0.05)
     (line,) = lines
     assert "a has scans of other sensors" in line
-
-
-@pytest.mark.parametrize("record", [None, 3, {QUANTILES_KEY: []}, {"augment": 1}])
-def test_weights_that_carry_no_quantiles_have_those_of_their_sensor(record: Any) -> None:
-    trained = trained_intensity({"range_net": record}, "hdl64e")
-    assert trained is not None
-    assert not trained.is_optional
-    np.testing.assert_array_equal(trained.quantiles, TRAINED)
-    assert trained_intensity({"range_net": record}, "homemade") is None
 
 
 @pytest.mark.parametrize(
@@ -192,47 +179,46 @@ def test_weights_that_carry_no_quantiles_have_those_of_their_sensor(record: Any)
     ],
 )
 def test_quantiles_that_no_intensities_have_are_refused(values: Any) -> None:
-    fails(
-        lambda: trained_intensity({"polar_net": {QUANTILES_KEY: values}}, "hdl64e"),
-        "quantiles",
-        "polar_net",
-    )
+    tree = weights_with().expects.to_dict()
+    tree["intensity"]["quantiles"] = values
+    fails(lambda: Expectation.from_dict(tree, RangeViewConfig()), "11 quantiles", "not all equal")
+
+
+def measured_intensity(data: SemanticKitti, sequences: Sequence[str]) -> TrainedIntensity | None:
+    """Return the intensities that networks expect which are trained on a dataset from scratch."""
+    scans = TrainingScans(data, data.records(sequences), ())
+    weights = without(fresh_weights(), *PARTS)
+    return expected_after(Plan(Recipe(), scans, data.root, stages=("rv", "bev")), weights).intensity
 
 
 def test_scans_without_intensities_have_quantiles_of_zero_and_equal_ones_are_left_out(
     tmp_path: Path,
 ) -> None:
-    for level, expected in ((0.0, [0.0] * len(PROBABILITIES)), (0.5, [])):
+    none = TrainedIntensity((0.0,) * len(PROBABILITIES))
+    for level, expected in ((0.0, none), (0.5, None)):
         root = tmp_path / f"{level}"
         for index in range(2):
             points, raw = street(index)
             points[:, 3] = level
             write_scan(root, "00", f"{index:06d}", points, raw)
-        data = SemanticKitti(root)
-        record = sensor_record(data, data.records(["00"]))
-        assert record[QUANTILES_KEY] == expected
-        trained = trained_intensity({"polar_net": record}, "")
-        assert (None if trained is None else trained.quantiles) == (expected or None)
+        assert measured_intensity(SemanticKitti(root), ["00"]) == expected
 
-    matched = {"polar_net": {QUANTILES_KEY: [0.0] * len(PROBABILITIES), MATCHED_KEY: True}}
-    fails(lambda: trained_intensity(matched, ""), "quantiles", "polar_net")
+    fails(lambda: replace(none, is_matched=True), "quantiles")
 
 
 def test_training_measures_the_intensities_that_weights_carry(tmp_path: Path) -> None:
     data = SemanticKitti(make_streets(tmp_path, ("00", "01"), 2))
     records = data.records(("00", "01"))
-    quantiles = sensor_record(data, records)[QUANTILES_KEY]
+    intensity = measured_intensity(data, ("00", "01"))
 
     each = [np.quantile(data.read(record).points[:, 3], PROBABILITIES) for record in records]
-    np.testing.assert_allclose(quantiles, np.mean(each, axis=0), atol=1e-4)
-    trained = trained_intensity({"polar_net": {QUANTILES_KEY: quantiles}}, "")
-    assert trained is not None
-    assert trained.quantiles == quantiles
+    assert intensity is not None
+    np.testing.assert_allclose(intensity.quantiles, np.mean(each, axis=0), atol=1e-4)
 
 
 def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> None:
     points = scan_points()
-    segmenter = amvnet.load(weights_with({}))
+    segmenter = amvnet.load(weights_with())
     wrong = points * np.array([1, 1, 1, 255], np.float32)
     fails(lambda: segmenter(wrong), "[0, 1]", "divide")
 
@@ -243,12 +229,8 @@ def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> 
     np.testing.assert_array_equal(segmenter(wild).labels, segmenter(clipped).labels)
     assert wild[7, 3] == 300
 
-    raw = {"range_net": {QUANTILES_KEY: np.linspace(0, 255, 11).tolist()}}
-    assert len(amvnet.load(weights_with(raw))(wrong).labels) == len(points)
-
-
-BY_SCAN = TrainedIntensity(SIMULATED_QUANTILES["hdl64e"], is_matched=True)
-MATCHED_RECORDS = {"range_net": {MATCHED_KEY: True}, "polar_net": {MATCHED_KEY: True}}
+    raw = with_intensities(fresh_weights(), np.linspace(0, 255, 11).tolist())
+    assert len(amvnet.load(raw)(wrong).labels) == len(points)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +242,7 @@ def test_a_matched_scan_has_the_intensities_of_the_training_in_the_same_order(
     points = scan_points()
     points[:, 3] = change(points[:, 3])
     points[7, 3] = np.nan
-    scan = match_scan(Scan(points), BY_SCAN)
+    scan = match_scan(Scan(points), SIMULATED_QUANTILES["hdl64e"])
 
     valid = scan.valid
     found = np.quantile(scan.points[valid, 3], PROBABILITIES)
@@ -275,11 +257,11 @@ def test_a_scan_without_intensity_is_not_matched() -> None:
     points = scan_points()
     points[:, 3] = 0
     scan = Scan(points)
-    assert match_scan(scan, BY_SCAN) is scan
+    assert match_scan(scan, SIMULATED_QUANTILES["hdl64e"]) is scan
 
 
 def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> None:
-    weights = weights_with(MATCHED_RECORDS)
+    weights = weights_with(is_matched=True)
     points = scan_points()
     dark = points.copy()
     dark[:, 3] = points[:, 3] ** 2 / 2
@@ -290,23 +272,10 @@ def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> Non
 
     # The scan is labelled alike as a file: its normaliser leaves the intensities to the segmenter.
     said: list[str] = []
-    normaliser = normaliser_for(weights, None, said.append)
+    normaliser = Normaliser(weights.expects, None, said.append)
     normalised = normaliser(Cloud(dark[:, :3], dark[:, 3], name="a"), "a")
     np.testing.assert_allclose(normalised.points[:, 3], dark[:, 3], atol=1e-6)
     assert "spread as in the training" in said[0]
-
-
-@pytest.mark.parametrize("parts", [("range_net",), ("polar_net",)])
-def test_a_network_of_real_scans_ends_the_matching(parts: tuple[str, ...]) -> None:
-    records: dict[str, Any] = {name: {MATCHED_KEY: True} for name in ("range_net", "polar_net")}
-    trained = trained_intensity(records, "hdl64e")
-    assert trained is not None
-    assert trained.is_matched
-    for part in parts:
-        records[part] = {}
-    trained = trained_intensity(records, "hdl64e")
-    assert trained is not None
-    assert not trained.is_matched
 
 
 def test_matched_intensities_stay_at_most_one() -> None:

@@ -19,10 +19,10 @@ from amvnet.config.schema import RangeViewConfig
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.reading import normaliser_for
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
+from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lasers import SensorGeometry, measure
 from amvnet.sensors.lidars import (
@@ -34,7 +34,7 @@ from amvnet.sensors.lidars import (
     rotation_from_degrees,
 )
 from amvnet.sensors.measure import MEASURED_SCANS, raise_points
-from amvnet.sensors.normalise import Expectation, Normaliser, _row_view
+from amvnet.sensors.normalise import Normaliser, _row_view
 from amvnet.weights.file import save
 from lidarstreets import LIDAR_MODELS
 
@@ -42,7 +42,7 @@ from fixtures.commands import fails, files, run_cli
 from fixtures.examples import first_of, with_examples
 from fixtures.scan_writers import pcd_bytes, write_bag1
 from fixtures.sensors import LASERS, ground_height, place
-from fixtures.tiny import fresh_weights, make_streets
+from fixtures.tiny import fresh_weights, make_streets, trained_for
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 WEIGHTS = fresh_weights()
@@ -118,12 +118,12 @@ def test_real_sensors_have_the_height_that_is_known(name: str, model: str) -> No
 
 
 def make_normaliser(
-    sensor: Sensor | None = None, trained_for: str = "hdl64e", is_nuscenes: bool = False
+    sensor: Sensor | None = None, name: str = "hdl64e", is_nuscenes: bool = False
 ) -> tuple[Normaliser, list[str]]:
     """Return a normaliser for fresh weights, and the list of the lines that it says."""
     lines: list[str] = []
-    weights = replace(NUSCENES_WEIGHTS if is_nuscenes else WEIGHTS, sensor=trained_for)
-    return normaliser_for(weights, sensor, lines.append), lines
+    weights = trained_for(NUSCENES_WEIGHTS if is_nuscenes else WEIGHTS, name)
+    return Normaliser(weights.expects, sensor, lines.append), lines
 
 
 def make_cloud(points: np.ndarray, ring: np.ndarray | None = None) -> Cloud:
@@ -199,8 +199,8 @@ def test_axes_do_not_mirror(axes: Any) -> None:
 
 def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
     points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
-    weights = replace(WEIGHTS, sensor="hdl64e")
-    scan = normaliser_for(weights)(make_cloud(points), "a")
+    weights = trained_for(WEIGHTS, "hdl64e")
+    scan = Normaliser(weights.expects)(make_cloud(points), "a")
     np.testing.assert_array_equal(scan.points, points)
 
     segmenter = amvnet.load(weights)
@@ -240,7 +240,7 @@ def test_rows_by_elevation_reach_half_a_row_beyond_the_lasers() -> None:
 def test_weights_with_rings_as_rows_get_the_rows_of_the_training(kind: str) -> None:
     points, laser = place(LASERS["hdl32e"], 1.84)
     rings = {"none": None, "right": laser, "reversed": 31 - laser}
-    normaliser, _ = make_normaliser(trained_for="hdl32e", is_nuscenes=True)
+    normaliser, _ = make_normaliser(name="hdl32e", is_nuscenes=True)
     scan = normaliser(make_cloud(points, rings[kind]), "a")
     np.testing.assert_array_equal(rows_in_nuscenes(scan), 31 - laser)
 
@@ -440,8 +440,8 @@ def test_sensors_are_described_as_they_are_simulated() -> None:
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make weights for two sensors, and scans of another one."""
     root = tmp_path_factory.mktemp("sensors")
-    save(replace(WEIGHTS, sensor="hdl64e"), root / "w.safetensors")
-    save(replace(NUSCENES_WEIGHTS, sensor="hdl32e"), root / "ring.safetensors")
+    save(trained_for(WEIGHTS, "hdl64e"), root / "w.safetensors")
+    save(trained_for(NUSCENES_WEIGHTS, "hdl32e"), root / "ring.safetensors")
 
     points, _ = place(LASERS["vlp16"], 0.9)
     points.tofile(root / "robot.bin")
@@ -529,7 +529,7 @@ def test_mistakes_are_one_line(mistake: str, world: Path, tmp_path: Path) -> Non
 
 def test_scans_of_datasets_are_not_normalised(tmp_path: Path) -> None:
     weights = tmp_path / "w.safetensors"
-    save(replace(WEIGHTS, sensor="hdl64e"), weights)
+    save(trained_for(WEIGHTS, "hdl64e"), weights)
     data = make_streets(tmp_path / "data", ("00",), 1)
     path = data / "sequences/00/velodyne/000000.bin"
     points = np.fromfile(path, np.float32).reshape(-1, 4)
@@ -567,9 +567,9 @@ def test_sensors_with_far_more_or_fewer_lasers_are_not_alike(beams: int, other: 
 
 
 def test_a_stated_unit_settles_that_a_sensor_is_high() -> None:
-    weights = replace(WEIGHTS, sensor="hdl64e")
+    weights = trained_for(WEIGHTS, "hdl64e")
     points, _ = place(LASERS["os1-64"], 6.0)
     cloud = Cloud(points[:, :3], np.linspace(0, 0.6, len(points)), name="a")
-    fails(lambda: normaliser_for(weights)(cloud, "a"), "--unit")
-    assert normaliser_for(weights, Sensor(unit="m"))(cloud, "a").valid.any()
-    assert normaliser_for(weights, Sensor(height=6.0))(cloud, "a").valid.any()
+    fails(lambda: Normaliser(weights.expects)(cloud, "a"), "--unit")
+    assert Normaliser(weights.expects, Sensor(unit="m"))(cloud, "a").valid.any()
+    assert Normaliser(weights.expects, Sensor(height=6.0))(cloud, "a").valid.any()

@@ -13,6 +13,7 @@ from amvnet.config.schema import HeadTraining
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.runtime.distributed import ALONE, Processes
+from amvnet.sensors.expectation import Expectation
 from amvnet.training.head_points import PointGatherer, PointSampler
 from amvnet.training.plan import Plan
 
@@ -77,7 +78,12 @@ def test_the_points_that_are_drawn_stand_for_all_uncertain_ones(tmp_path: Path) 
     points = []
     for most in (60, 10**6):
         path = write_recipe(tmp_path / "r.yaml", training={"head": {"points": most}})
-        plan = Plan(load_recipe(str(path)), TrainingScans(dataset, records, []), tmp_path / "run")
+        plan = Plan(
+            load_recipe(str(path)),
+            TrainingScans(dataset, records, []),
+            tmp_path / "run",
+            expects=Expectation(),
+        )
         points.append(PointGatherer(plan, fresh_weights()).gather(records, tmp_path / str(most)))
 
     few, everything = points

@@ -10,25 +10,23 @@ import numpy as np
 import pytest
 
 from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import Recipe
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import split_records
-from amvnet.inference.reading import normalised, normaliser_for
+from amvnet.inference.reading import normalised
+from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import (
-    MATCHED_KEY,
-    QUANTILES_KEY,
     SIMULATED_QUANTILES,
-    adapt_intensity,
-    trained_intensity,
 )
-from amvnet.training.networks import intensity_of, make_loaders
+from amvnet.sensors.normalise import Normaliser
+from amvnet.training.expectation import expected_after, expected_before
+from amvnet.training.networks import make_loaders
 from amvnet.training.plan import Plan
 from amvnet.training.run import first_weights
-from amvnet.training.run_folder import PART_OF
-from amvnet.training.sensor_record import sensor_record
-from amvnet.weights.file import Weights
+from amvnet.weights.file import PARTS, Weights
 
-from fixtures.tiny import fake_drive, fresh_weights, street, write_recipe
+from fixtures.tiny import fake_drive, fresh_weights, street, with_intensities, write_recipe
 
 BOTH = ("rv", "bev")
 
@@ -51,13 +49,8 @@ def own(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     return root
 
 
-def trained_before(weights: Weights, no_intensity: float, is_matched: bool) -> Weights:
-    record = {
-        "augment": {"no_intensity": no_intensity},
-        QUANTILES_KEY: list(SIMULATED_QUANTILES["hdl64e"]),
-        MATCHED_KEY: is_matched,
-    }
-    return replace(weights, training={"range_net": record, "polar_net": record})
+def trained_before(weights: Weights, **how: bool) -> Weights:
+    return with_intensities(weights, SIMULATED_QUANTILES["hdl64e"], **how)
 
 
 @pytest.mark.parametrize("hides", [pytest.param(0.0, marks=pytest.mark.full), 0.3])
@@ -83,9 +76,9 @@ def test_predict_gives_finished_weights_the_intensities_of_their_training(
     classes = open_dataset(str(own / "robot.yaml")).taxonomy
     inits: dict[str, Weights | None] = {
         "none": None,
-        "same classes": trained_before(fresh_weights(classes), 0.25, is_matched=True),
-        "other classes": trained_before(fresh_weights(), 0.25, is_matched=True),
-        "unmatched": trained_before(fresh_weights(classes), 0.0, is_matched=False),
+        "same classes": trained_before(fresh_weights(classes), is_optional=True, is_matched=True),
+        "other classes": trained_before(fresh_weights(), is_optional=True, is_matched=True),
+        "unmatched": trained_before(fresh_weights(classes)),
     }
     init = inits[begin]
 
@@ -99,21 +92,34 @@ def test_predict_gives_finished_weights_the_intensities_of_their_training(
         stage="all" if stages == BOTH else stages[0],
     )
     weights = first_weights(plan, init, stages)
-    intensity = intensity_of(plan, weights)
-    if stages == ("head",):
-        intensity = trained_intensity(weights.training, weights.sensor)
-    _, val = make_loaders(plan, recipe.training.rv, intensity)
+    expects = expected_after(replace(plan, stages=stages), weights)
+    _, val = make_loaders(replace(plan, expects=expects), recipe.training.rv)
     assert val is not None
     in_training = val.dataset[(0, 0)]
 
-    augments = {"augment": {"no_intensity": hides}}
-    record = augments | sensor_record(plan.scans.dataset, plan.scans.train, intensity)
-    learnt = {PART_OF[name]: record for name in stages if name != "head"}
-    finished = replace(weights, training={**weights.training, **learnt})
-    dataset = normalised(open_dataset(data), normaliser_for(finished))
-    scan = dataset.read(plan.scans.val[0])
-    scan = adapt_intensity(scan, trained_intensity(finished.training, finished.sensor))
+    dataset = normalised(open_dataset(data), Normaliser(expects))
+    scan = expects.prepare(dataset.read(plan.scans.val[0]))
     np.testing.assert_allclose(scan.points, in_training.points, atol=1e-6)
+
+
+def test_networks_learn_to_do_without_intensities_unless_one_of_them_stays() -> None:
+    recipe = Recipe()
+    augment = replace(recipe.training.augment, no_intensity=0.25)
+    hiding = replace(recipe, training=replace(recipe.training, augment=augment))
+    known = Expectation.of_sensor("hdl64e")
+    for parts, stages, expected in (
+        ((), BOTH, True),
+        (PARTS, BOTH, True),
+        ((), ("rv",), True),
+        (("range_net",), ("rv",), True),
+        (PARTS, ("rv",), False),
+        (("range_net",), ("bev",), False),
+        (PARTS, ("head",), False),
+    ):
+        before = expected_before(known, parts, hiding, stages)
+        assert before.intensity is not None
+        assert before.intensity.is_optional == expected
+        assert expected_before(before, parts, recipe, stages) == before  # they forget nothing
 
 
 def test_streets_that_are_joined_with_others_are_matched_as_streets_alone(
@@ -130,7 +136,8 @@ def test_streets_that_are_joined_with_others_are_matched_as_streets_alone(
         plan = Plan.open(
             recipe, data, tmp_path / "run", lambda each: split_records(each, ["0"], ["900000"])
         )
-        found.append(intensity_of(plan, Weights(recipe.model, plan.scans.dataset.taxonomy, "x")))
+        weights = Weights(recipe.model, plan.scans.dataset.taxonomy)
+        found.append(expected_after(plan, weights).intensity)
     assert found[0].is_matched
     assert found[0].is_optional  # a quarter of the streets hide their intensities
     assert found[0] == found[1]

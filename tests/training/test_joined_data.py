@@ -12,7 +12,7 @@ import torch
 import yaml
 
 from amvnet.config.recipes import load_recipe
-from amvnet.config.schema import AugmentConfig
+from amvnet.config.schema import AugmentConfig, Recipe
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.joined import MixedRecord, join
@@ -21,14 +21,16 @@ from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.select import TrainingScans, all_to_train, split_records
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.reading import normalised, normaliser_for
+from amvnet.inference.reading import normalised
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
+from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
-from amvnet.sensors.record import AS_IS_KEY, SENSOR_KEY
 from amvnet.training import checking
 from amvnet.training.augment import mix
 from amvnet.training.checking import check_data
+from amvnet.training.expectation import expected_after
 from amvnet.training.loaders import ScanSet, collate
 from amvnet.training.losses import rival_classes
 from amvnet.training.plan import (
@@ -37,7 +39,6 @@ from amvnet.training.plan import (
     sized_by_init,
     without_initial_weights,
 )
-from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.commands import refusal, run_cli
@@ -191,7 +192,7 @@ def test_scans_that_are_mixed_into_others_are_of_the_same_epoch(
 
     monkeypatch.setattr(scans.dataset, "at_epoch", record_epoch)
     augmented = AugmentConfig(mix=1, laser_mix=1, paste=1)
-    assert len(ScanSet(scans.dataset, scans.train, augmented)[5, 0])
+    assert len(ScanSet(scans.dataset, scans.train, Expectation(), augmented)[5, 0])
     assert epochs == [5] * 4  # the scan, and one for each way to mix
 
 
@@ -248,8 +249,8 @@ def test_ones_own_scans_are_brought_to_the_initial_weights_rather_than_to_earlie
 ) -> None:
     by_height = {}
     for height in (1.0, 2.0):
-        record = {"range_net": {SENSOR_KEY: {"height": height}}}
-        by_height[height] = replace(fresh_weights(), training=record)
+        expects = Expectation(sensor=Sensor(height=height))
+        by_height[height] = replace(fresh_weights(), expects=expects)
     recipe = sized_by_init(load_recipe("finetune"), by_height[2.0])
 
     def target(init: Weights | None) -> float | None:
@@ -267,7 +268,7 @@ def test_ones_own_scans_are_brought_to_the_initial_weights_rather_than_to_earlie
 def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) -> None:
     """Scans with rows and scans without are mixed point by point."""
     scans = joined(tmp_path, 0)
-    own = normalised(open_dataset(str(own_file)), normaliser_for(fresh_weights()))
+    own = normalised(open_dataset(str(own_file)), Normaliser(fresh_weights().expects))
     mixed = join(scans, [TrainingScans(own, own.records(own.sequences("all")), [])])
     a, b = (mixed.dataset.read(record) for record in (mixed.train[0], mixed.train[-1]))
     assert a.row is None
@@ -288,14 +289,15 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
 ) -> None:
     paths = [make_own_scans(tmp_path / name) for name in "ab"]
     weights = fresh_weights(open_own(paths[0]).taxonomy)
-    own = [normalised(open_dataset(str(path)), normaliser_for(weights)) for path in paths]
-    records = [dataset.records(dataset.sequences("train")) for dataset in own]
-    scans = join(TrainingScans(own[0], records[0], ()), [TrainingScans(own[1], records[1], ())])
+    own = [normalised(open_dataset(str(path)), Normaliser(weights.expects)) for path in paths]
+    a, b = [TrainingScans(each, each.records(each.sequences("train")), ()) for each in own]
 
-    record = sensor_record(scans.dataset, scans.train)
+    def expected(scans: TrainingScans) -> Expectation:
+        return expected_after(Plan(Recipe(), scans, tmp_path, stages=("rv", "bev")), weights)
 
-    assert AS_IS_KEY not in record[SENSOR_KEY]
-    assert record[SENSOR_KEY] == sensor_record(own[0], records[0])[SENSOR_KEY]
+    both = expected(join(a, [b]))
+    assert not both.as_is
+    assert both.sensor == expected(a).sensor
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import simulated_intensity
+from amvnet.sensors.expectation import Expectation
 from amvnet.training.loaders import ScanSet
 from amvnet.training.losses import Targets, dice, distillation_loss, lovasz_softmax, rival_classes
 from amvnet.training.networks import PolarStage, make_loaders, make_stage
@@ -226,14 +226,14 @@ def test_validation_scans_are_read_like_training_scans_and_not_augmented() -> No
     for name in ("a", "b"):
         path = Path(f"{name}.bin")
         records.append(ScanRecord(name, "00", path, None, prediction=f"{name}.label"))
-    plan = Plan(recipe, TrainingScans(dataset, records[:1], records[1:]), Path("run"))
-    intensity = simulated_intensity("hdl64e")
+    expects = Expectation(view)
+    scans = TrainingScans(dataset, records[:1], records[1:])
+    plan = Plan(recipe, scans, Path("run"), expects=expects)
 
-    train, val = make_loaders(plan, CONFIG, intensity)
+    train, val = make_loaders(plan, CONFIG)
     assert val is not None
     for loader, is_augmented in ((train, True), (val, False)):
-        scans = loader.dataset
-        assert isinstance(scans, ScanSet)
-        assert scans.lasers == view.height
-        assert scans.intensity is intensity
-        assert (scans.augment is not None) == is_augmented
+        loaded = loader.dataset
+        assert isinstance(loaded, ScanSet)
+        assert loaded.expects is expects
+        assert (loaded.augment is not None) == is_augmented

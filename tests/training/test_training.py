@@ -26,7 +26,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import MATCHED_KEY, PROBABILITIES, QUANTILES_KEY, SIMULATED_QUANTILES
+from amvnet.sensors.intensity import PROBABILITIES, SIMULATED_QUANTILES, TrainedIntensity
 from amvnet.training import loaders, networks
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights, SeedBatches
@@ -48,6 +48,7 @@ from fixtures.tiny import (
     fake_drive,
     fresh_weights,
     make_streets,
+    with_intensities,
     without,
     write_recipe,
 )
@@ -216,10 +217,11 @@ def test_the_weights_describe_their_training(run: Path) -> None:
         assert training["sequences"] == ["00", "01"]
         assert training["validated_on"] == ["08"]
         assert training["seed"] == 0
-        assert len(training[QUANTILES_KEY]) == len(PROBABILITIES)
-        assert 0 <= training[QUANTILES_KEY][0] < training[QUANTILES_KEY][-1] <= 1
     assert weights.training["range_net"]["rv"]["epochs"] == 3
     assert weights.model.range_view.width == 64
+    assert weights.expects.as_is
+    assert weights.expects.intensity is not None
+    assert weights.expects.intensity.are_fractions
 
 
 def test_a_run_leaves_no_temporary_files(run: Path) -> None:
@@ -395,9 +397,9 @@ def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
         assert {name[:6] for name in file["scans"].tolist()} == {"000000", "000001"}
 
     # The intensities of all scans were brought to those that predictions are brought to.
-    record = whole.training["range_net"]
-    assert record[MATCHED_KEY] is True
-    assert record[QUANTILES_KEY] == list(SIMULATED_QUANTILES["hdl64e"])
+    assert whole.expects.intensity == TrainedIntensity(
+        SIMULATED_QUANTILES["hdl64e"], is_matched=True
+    )
 
     # Another cache, which a worker fills.
     others = ("--data", f"simulated-hdl64e:{tmp_path / 'other'}", "--training.workers", 1)
@@ -415,16 +417,13 @@ def test_tuning_weights_of_matched_intensities_matches_the_other_scans_too(
     world: Path, run: Path, tmp_path: Path
 ) -> None:
     weights = load(run / "weights.safetensors")
-    matched = {
-        MATCHED_KEY: True,
-        QUANTILES_KEY: (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist(),
-    }
-    records = {part: {**record, **matched} for part, record in weights.training.items()}
-    save(replace(weights, training=records), tmp_path / "init.safetensors")
+    quantiles = (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist()
+    matched = with_intensities(weights, quantiles, is_matched=True)
+    save(matched, tmp_path / "init.safetensors")
 
     options = ("--stage", "rv", "--init", tmp_path / "init.safetensors")
-    tuned = train(world, tmp_path / "run", *options).training["range_net"]
-    assert {name: tuned[name] for name in matched} == matched
+    tuned = train(world, tmp_path / "run", *options)
+    assert tuned.expects.intensity == matched.expects.intensity
 
     # In training, the network is validated on what it gets in a prediction.
     report = tmp_path / "report.json"

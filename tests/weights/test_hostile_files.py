@@ -176,6 +176,7 @@ def description(weights: Weights) -> dict[str, Any]:
         "model": to_dict(weights.model),
         "taxonomy": weights.taxonomy.to_dict(),
         "sensor": weights.sensor,
+        "expects": weights.expects.to_dict(),
         "training": weights.training,
         "metrics": weights.metrics,
     }

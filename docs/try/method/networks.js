@@ -5,7 +5,7 @@ import { fetchedJson, unpacked } from "../files.js";
 import { scoreHidden } from "./range_view.js";
 import { addToMaxima, atCells, FEATURES, toMap } from "./polar_view.js";
 
-const FORMAT = 2, DESCRIPTION = "amvnet.json", ADVICE = "export the weights again with amvnet export";
+const FORMAT = 3, DESCRIPTION = "amvnet.json", ADVICE = "export the weights again with amvnet export";
 const POLAR = ["polar_points", "polar_pillars", "polar_map", "polar_scores"];
 // The graphs that each method needs.
 const GRAPHS = {
@@ -21,10 +21,9 @@ const PART = 16_384;  // the number of points or pillars that a graph takes at a
 /** Read the description in a folder of `amvnet export`. */
 export async function readDescription(folder) {
   const description = await fetchedJson(`${folder}/${DESCRIPTION}`, ADVICE);
-  if (description.format !== FORMAT || !(description.method in GRAPHS) || !description.normalise) {
+  if (description.format !== FORMAT || !(description.method in GRAPHS)) {
     throw new InputError(
-      `${folder}/${DESCRIPTION}: expected format ${FORMAT}, a known method and the key normalise, found another file; ` +
-      ADVICE,
+      `${folder}/${DESCRIPTION}: expected format ${FORMAT} and a known method, found another file; ${ADVICE}`,
     );
   }
   return description;

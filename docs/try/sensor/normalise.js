@@ -16,7 +16,7 @@ const SAME_BEAMS = 1.4;  // the largest ratio of two numbers of lasers that are 
  * Return {points, rows, places, text}. The valid points are normalised (4 n: x, y, z in metres, intensity in [0, 1]).
  * With them come their rows in the range image, or null, their places in the cloud, and a line on what was assumed.
  *
- * `expected` describes the scans that the weights know: {view, sensor, intensity, isAsIs}.
+ * `expected` describes the scans that the weights know: {view, sensor, intensity, as_is}.
  */
 export function normalise(cloud, expected) {
   const { name, xyz, count } = cloud, { sensor } = expected;
@@ -118,6 +118,6 @@ function sensorText(lasers, sensor) {
   const ratio = lasers.beams && sensor.beams ? lasers.beams / sensor.beams : 1;
   const isLike = ratio > 1 / SAME_BEAMS && ratio < SAME_BEAMS && hasEndsOf(lasers, sensor);
   if (sensor.fov_up === null || sensor.fov_down === null || isLike) return "";
-  const name = sensor.is_like_sheet ? sensor.name : "a sensor";
+  const name = sensor.name || "a sensor";
   return `; the weights were trained for ${name} (${lasersText(sensor)}) and have seen no such sensor`;
 }

@@ -23,7 +23,7 @@ export function rowAt(elevation, { fov_up: top, fov_down: bottom, height }) {
  * `points` (4 n) are the valid points in the sensor's frame, `places` (n) are their places in the cloud, and `lasers`
  * holds what was measured of the sensor.
  */
-export function rowsOf(points, places, cloud, lasers, { view, sensor, isAsIs }) {
+export function rowsOf(points, places, cloud, lasers, { view, sensor, as_is: isAsIs }) {
   const byLaser = (ring) => ring && Int32Array.from(places, (place) => view.height - 1 - ring[place]);
   if (view.rows === "laser" && hasEndsOf(lasers, sensor)) {
     const ring = cloud.ring ?? lasersByOrder(cloud.xyz, view.height), highest = ring ? Math.max(...new Set(ring)) : -1;
@@ -34,7 +34,7 @@ export function rowsOf(points, places, cloud, lasers, { view, sensor, isAsIs }) 
   const byElevation = viewByElevation(elevations, lasers, { view, sensor, isAsIs });
   const rings = view.rows === "ring" ? byLaser(cloud.ring) : null;
   // Lasers that no data sheet describes need not be evenly spaced.
-  if (!byElevation || (rings && !sensor.is_known)) return rings;
+  if (!byElevation || (rings && !sensor.name)) return rings;
 
   const rows = Int32Array.from(elevations, (elevation) => rowAt(elevation, byElevation));
   const isRing = rings && rows.filter((row, i) => row === rings[i]).length >= rows.length / 2;

@@ -107,9 +107,9 @@ class CloudSegmenter:
         import torch
 
         import amvnet
-        from amvnet.inference.reading import normaliser_for
         from amvnet.runtime.memory import keep_freed_memory
         from amvnet.sensors.lidars import make_sensor
+        from amvnet.sensors.normalise import Normaliser
 
         sensor = make_sensor(**settings.sensor_options())
         if settings.threads > 0:
@@ -128,7 +128,7 @@ class CloudSegmenter:
         self.hardware = segmenter.engine.hardware
         self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
-        self._normalise = normaliser_for(segmenter.weights, sensor, report)
+        self._normalise = Normaliser(segmenter.weights.expects, sensor, report)
         self._segment = segmenter
         self._fuse = None if find_pose is None else PastFusion(find_pose)
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)

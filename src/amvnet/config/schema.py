@@ -74,11 +74,6 @@ class RangeViewConfig(Checked):
         )
         _check_cells(self, self.height, self.width)
 
-    @property
-    def lasers(self) -> int:
-        """Number of lasers to find in a scan without rings; 0 if the rows are not lasers."""
-        return self.height if self.rows == "laser" else 0
-
     def has_laser_per_row(self, highest: Any) -> Any:
         """Return whether a sensor has one laser for each row.
 

@@ -2,26 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
-
-from amvnet.scan import Scan
 
 # The largest mean deviation of the slopes z / hypot(x, y) of one laser; about 2 degrees.
 SLOPE_SPREAD = 0.035
 MIN_POINTS = 64  # the least mean number of points of a laser; fewer do not show an order
-
-
-def with_lasers(scan: Scan, lasers: int) -> Scan:
-    """Return a scan with rings, if it has none and `lasers_by_order` finds them.
-
-    Args:
-        lasers: the number of lasers of the sensor. If it is 0, the scan is returned unchanged.
-    """
-    if not lasers or scan.ring is not None:
-        return scan
-    return dataclasses.replace(scan, ring=lasers_by_order(scan.points, lasers))
 
 
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")

@@ -16,10 +16,9 @@ from amvnet.errors import InputError
 from amvnet.export.onnx_files import digest, quiet, remove_notes
 from amvnet.files import temporary_folder
 from amvnet.inference.listing import list_inputs
-from amvnet.inference.reading import normaliser_for
 from amvnet.onnx_runner import OnnxSegmenter, open_session
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import match_scan, trained_intensity
+from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
 
 SIMULATED = "simulated"  # stands for simulated streets, as the weights' sensor sees them
@@ -39,7 +38,7 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
 
     Args:
         text: a dataset, a scan file, a folder of scan files, or `SIMULATED`.
-        weights: the weights to which the scans are normalised.
+        weights: the weights for which the scans are prepared.
 
     Raises:
         InputError: if there are no scans, one is broken, or the weights' sensor cannot be
@@ -71,7 +70,7 @@ def quantise(
     Args:
         folder: the output folder of `amvnet export`.
         names: the graphs to quantise, all of them in `KEEPS_FIRST_LAYER`.
-        scans: the scans, normalised to the weights.
+        scans: the scans, prepared for the networks (`Expectation.prepare`).
 
     Yields:
         The name of each graph and the new values in its description: `precision`, `sha256`, and
@@ -125,15 +124,14 @@ class _Recorder(OnnxSegmenter):
 
 
 def _read(text: str, weights: Weights) -> list[Scan]:
-    """Read up to `MAX_SCANS` scans, evenly spaced, normalised as `predict` normalises them."""
-    normaliser = normaliser_for(weights)
+    """Read up to `MAX_SCANS` scans, evenly spaced, prepared as `predict` prepares them."""
+    normaliser = Normaliser(weights.expects)
     inputs, _ = list_inputs([text], taxonomy=weights.taxonomy, normaliser=normaliser)
-    intensity = trained_intensity(weights.training, weights.sensor)
     scans = []
     for scan_input in evenly_spaced(inputs, MAX_SCANS):
         scan = scan_input.load().scan
         if scan.valid.any():
-            scans.append(match_scan(scan, intensity))
+            scans.append(weights.expects.prepare(scan))
 
     if not scans:
         raise InputError(

@@ -20,7 +20,6 @@ from amvnet.errors import InputError, import_optional
 from amvnet.export.int8 import KEEPS_FIRST_LAYER, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, remove_notes
 from amvnet.files import atomic_write, publish, temporary_folder
-from amvnet.inference.reading import expectation_of
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName, check_method, widest_method
 from amvnet.models.point_head import head_features, point_table
@@ -30,10 +29,6 @@ from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS_BY_METHOD
 from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
-from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity, trained_intensity
-from amvnet.sensors.lasers import MEASURES
-from amvnet.sensors.lidars import KNOWN_SENSORS
-from amvnet.sensors.normalise import Expectation
 from amvnet.weights.file import Weights, load
 
 GRAPH = Signature("an ONNX graph", rb"\x08.\x12.(pytorch|onnx)")
@@ -182,7 +177,6 @@ def describe_export(weights: Weights, method: MethodName, graphs: dict[str, Any]
     """Return everything that a program needs to use the graphs, for JSON."""
     model = weights.model
     taxonomy = weights.taxonomy
-    trained = trained_intensity(weights.training, weights.sensor)
     classes = []
     rows = zip(("ignored", *taxonomy.classes), taxonomy.train_to_raw, taxonomy.colors, strict=True)
     for train_id, (name, raw, color) in enumerate(rows):
@@ -193,13 +187,8 @@ def describe_export(weights: Weights, method: MethodName, graphs: dict[str, Any]
         "made_by": f"amvnet {version('amvnet')}, torch {torch.__version__}",
         "method": method,
         "sensor": weights.sensor,
-        "points": {
-            "columns": ["x", "y", "z", "intensity"],
-            "farthest": FARTHEST,
-            "intensity": _intensity_range(trained),
-        },
-        "intensity": _describe_intensity(trained),
-        "normalise": describe_expectation(expectation_of(weights)),
+        "points": {"columns": ["x", "y", "z", "intensity"], "farthest": FARTHEST},
+        "expects": weights.expects.to_dict(),
         "range_view": to_dict(model.range_view),
         "range_channels": ["x", "y", "z", "intensity", "range", "mask"],
         "polar_view": to_dict(model.polar_view),
@@ -225,35 +214,6 @@ def describe_export(weights: Weights, method: MethodName, graphs: dict[str, Any]
 
     described = {"taxonomy": taxonomy.name, "classes": classes, "opset": OPSET, "graphs": graphs}
     return description | described
-
-
-def _intensity_range(trained: TrainedIntensity | None) -> list[float] | None:
-    """Return the range of the intensities, [0, 1]; None if the training had another range."""
-    return [0.0, 1.0] if trained is None or trained.are_fractions else None
-
-
-def _describe_intensity(trained: TrainedIntensity | None) -> dict[str, list[float]] | None:
-    """Return the distribution to which intensities are matched; None if they are not matched."""
-    if trained is None or not trained.is_matched:
-        return None
-    return {"probabilities": list(PROBABILITIES), "quantiles": list(trained.quantiles)}
-
-
-def describe_expectation(expected: Expectation) -> dict[str, Any]:
-    """Describe the scans that some weights expect, for programs that normalise scans themselves."""
-    sensor = expected.sensor
-    sheet = KNOWN_SENSORS.get(sensor.name)
-    intensity = expected.intensity
-    return {
-        "sensor": {
-            "name": sensor.name,
-            "is_known": sheet is not None,
-            "is_like_sheet": sheet is not None and sheet.beams == sensor.beams,
-            **{key: getattr(sensor, key) for key in MEASURES},
-        },
-        "as_is": expected.as_is,
-        "intensity": None if intensity is None else to_dict(intensity),
-    }
 
 
 def _graphs(weights: Weights, method: MethodName) -> dict[str, Graph]:

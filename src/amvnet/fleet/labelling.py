@@ -32,13 +32,13 @@ from amvnet.fleet.storage import Place
 from amvnet.inference.listing import FileReader, FileScan, Outcome
 from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
-from amvnet.inference.reading import normaliser_for
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation, uncertain_share
 from amvnet.models.methods import Compute
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
+from amvnet.sensors.normalise import Normaliser
 
 TRANSFERS = 8  # number of files that are fetched from object storage at the same time
 # The column that says whether an error stops the run, because no labels can be written.
@@ -217,7 +217,7 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
 
 
 def _make_reader(request: LabellingRequest, report: Reporter = report_nothing) -> FileReader:
-    return FileReader(normaliser_for(request.weights, request.sensor, report))
+    return FileReader(Normaliser(request.weights.expects, request.sensor, report))
 
 
 @contextmanager

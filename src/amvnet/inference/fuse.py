@@ -12,12 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults
-from amvnet.inference.reading import checked_scan, normaliser_for
+from amvnet.inference.reading import checked_scan
 from amvnet.inference.scores import LEAST_PROBABILITY, ScorePair, as_probabilities, have_opinion
 from amvnet.inference.segmentation import Segmentation, fetch, unpack
 from amvnet.models.amvnet import LateFusion, Scores
@@ -26,9 +25,8 @@ from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import AnyArray, Scan, as_array
-from amvnet.sensors.intensity import adapt_intensity, trained_intensity
-from amvnet.sensors.lidars import Sensor
-from amvnet.sensors.normalise import Expectation, Normaliser
+from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights, load
 
 Head = PointHead | Weights | Path | str | None
@@ -44,10 +42,9 @@ class Fusion:
     def __init__(self, head: Head = None, tau: float | None = None) -> None:
         if isinstance(head, str | Path):
             head = load(head)
-        self._intensity = None
+        self.expects = Expectation()
         if isinstance(head, Weights):
-            # The head also sees the intensities.
-            self._intensity = trained_intensity(head.training, head.sensor)
+            self.expects = head.expects  # the head also sees the intensities
             tau = head.model.assertion.threshold if tau is None else tau
             head = head.build_head()
 
@@ -66,7 +63,7 @@ class Fusion:
         Raises:
             InputError: if the shapes do not fit, or the scores are not probabilities.
         """
-        scan = adapt_intensity(checked_scan(points, trained=self._intensity), self._intensity)
+        scan = self.expects.prepare(checked_scan(points, trained=self.expects.intensity))
         f_all = as_array(f, "scores f").astype(np.float32, copy=False)
         g_all = as_array(g, "scores g").astype(np.float32, copy=False)
         self._check_shapes(scan, f_all, g_all)
@@ -171,19 +168,15 @@ def fuse_files(
             user would be replaced; at the end, if the scores of all scans are broken.
         SomeBroken: at the end, if the scores of some scans are broken.
     """
-    if head is None:
-        normaliser = Normaliser(Expectation(ModelConfig().range_view, Sensor()))
-    else:  # the head takes scans like the networks that it was trained with
-        normaliser = normaliser_for(head)
+    fusion = Fusion(head, tau)
+    if head is not None:
         taxonomy = head.taxonomy
-
-    scans, taxonomy = list_inputs(inputs, options, taxonomy, normaliser)
+    scans, taxonomy = list_inputs(inputs, options, taxonomy, Normaliser(fusion.expects))
     scores = []
     for scan in scans:  # raises before anything is written
         scores += [pair.a.find(scan.scores_path), pair.b.find(scan.scores_path)]
     output = replace(output, also_read=[*output.also_read, *scores])
 
-    fusion = Fusion(head, tau)
     silent: Counter[str] = Counter()  # by side, the points without an opinion of the model
 
     def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:

@@ -12,13 +12,13 @@ from amvnet.inference.drive import DriveChoice, find_poses
 from amvnet.inference.journal import Entry, describe_other_run
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import Pipeline, Segment, check_faults, check_output
-from amvnet.inference.reading import normaliser_for
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
 from amvnet.scan import Scan
+from amvnet.sensors.normalise import Normaliser
 
 SHOWN_RECORDINGS = 10  # the most doubtful recordings that are named, each in a line
 # What a user can try if the labels are doubtful.
@@ -74,7 +74,7 @@ def predict(
         SomeBroken: at the end, if some of several scans are broken.
     """
     classes = request.classes
-    normaliser = normaliser_for(request.weights, request.sensor, report)
+    normaliser = Normaliser(request.weights.expects, request.sensor, report)
     options = ScanOptions(sequences, split, request.topic, request.layout)
     scans, taxonomy = list_inputs(inputs, options, request.weights.taxonomy, normaliser)
     if classes is not None:

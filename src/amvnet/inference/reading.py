@@ -12,13 +12,10 @@ from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.cloud import require_columns
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
-from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
-from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
+from amvnet.sensors.intensity import TrainedIntensity, describe_filler
 from amvnet.sensors.lidars import Sensor, make_sensor
-from amvnet.sensors.normalise import Expectation, Normaliser
-from amvnet.sensors.record import is_trained_as_is, trained_sensor
-from amvnet.weights.file import Weights
+from amvnet.sensors.normalise import Normaliser
 
 # Largest number of columns of an array of points; an array with more columns is taken for a
 # transposed one.
@@ -101,28 +98,6 @@ def _check_shape(array: np.ndarray) -> None:
     if array.ndim == 3:
         advice += ", or give several scans to Segmenter.many"
     raise InputError(f"scan: expected {EXPECTED}, found {array.shape}; {advice}")
-
-
-def normaliser_for(
-    weights: Weights, sensor: Sensor | None = None, report: Reporter = report_nothing
-) -> Normaliser:
-    """Return the normaliser of scan files for some weights.
-
-    Args:
-        sensor: what is known about the sensor; the rest is measured.
-        report: takes a line about what was assumed of the sensor.
-    """
-    return Normaliser(expectation_of(weights), sensor, report)
-
-
-def expectation_of(weights: Weights) -> Expectation:
-    """Return the scans that some weights expect."""
-    return Expectation(
-        weights.model.range_view,
-        trained_sensor(weights.training, weights.sensor),
-        intensity=trained_intensity(weights.training, weights.sensor),
-        as_is=is_trained_as_is(weights.training),
-    )
 
 
 def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:

@@ -8,19 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, parse_layout
-from amvnet.data.laser_order import with_lasers
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import checked_scan, normaliser_for
+from amvnet.inference.reading import checked_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.memory import return_freed_memory
 from amvnet.scan import AnyArray, Scan
-from amvnet.sensors.intensity import adapt_intensity, trained_intensity
+from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
 
 # The least number of points in a batch whose freed memory is returned to the system, because no
@@ -39,16 +38,12 @@ class Segmenter:
         weights, engine: as given.
         at_once: the number of scans to segment at the same time, each with its share of torch's
             threads; by default the number that the engine suggests.
-        intensity: how intensities are distributed in the training scans. The intensities of a scan
-            may be matched to it (`sensors.intensity.match_scan`). None if it is unknown.
     """
 
     def __init__(self, weights: Weights, engine: Engine) -> None:
         self.weights = weights
         self.engine = engine
         self.at_once = engine.at_once
-
-        self.intensity = trained_intensity(weights.training, weights.sensor)
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -111,7 +106,7 @@ class Segmenter:
                 "leave them out"
             )
         if not isinstance(points, Path | str):
-            return self._segment([checked_scan(points, columns, self.intensity)])[0]
+            return self._segment([checked_scan(points, columns, self.weights.expects.intensity)])[0]
 
         scans, assumed = self._open(points, layout=parse_layout(columns))
         if len(scans) > 1:
@@ -131,7 +126,7 @@ class Segmenter:
         """
         checked = []
         for scan in scans:
-            checked.append(checked_scan(scan, trained=self.intensity))
+            checked.append(checked_scan(scan, trained=self.weights.expects.intensity))
         return self._segment(checked)
 
     def _segment(self, scans: Sequence[Scan]) -> list[Segmentation]:
@@ -176,7 +171,7 @@ class Segmenter:
         When the scans are read, the list receives a line on what was assumed of their sensor.
         """
         assumed: list[str] = []
-        normaliser = normaliser_for(self.weights, report=assumed.append)
+        normaliser = Normaliser(self.weights.expects, report=assumed.append)
         options = ScanOptions(topic=topic, layout=layout)
         scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
         return scans, assumed
@@ -193,18 +188,10 @@ class Segmenter:
         return replace(result, origin=origin)
 
     def batch(self, scans: Sequence[Scan]) -> PointBatch:
-        """Return the P valid points of some scans as one batch on the device.
-
-        If the weights say so, the intensities of each scan are matched to the training scans. If
-        the rows of the range image are lasers, and a scan has no rings, its lasers are recovered
-        from the order of its points (`with_lasers`).
+        """Return the P valid points of some scans, prepared for the networks, as one batch.
 
         Raises:
             InputError: if more than a few intensities are out of range.
         """
-        prepared = []
-        for scan in scans:
-            if scan.row is None:
-                scan = with_lasers(scan, self.weights.model.range_view.lasers)
-            prepared.append(adapt_intensity(scan, self.intensity))
-        return PointBatch.of(prepared, self.device)
+        expects = self.weights.expects
+        return PointBatch.of([expects.prepare(scan) for scan in scans], self.device)

@@ -7,9 +7,8 @@ them. All decisions rest on quantiles, so that a few outliers change nothing.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -29,8 +28,6 @@ ALIKE_FACTOR = 2.0
 ONE_RANGE_FACTOR = 8.0
 # Intensities are constant if 98 % of them differ by at most this share of their median.
 CONSTANT_SHARE = 0.01
-# Networks need no intensity if they were trained with this share of their scans without it.
-BLIND_SHARE = 0.2
 
 # Quantiles to which training brings the intensities of simulated scans. Weights without quantiles
 # of their own use these.
@@ -39,10 +36,7 @@ SIMULATED_QUANTILES = {
     "hdl32e": (0.0, 0.0, 0.005, 0.007, 0.011, 0.039, 0.066, 0.11, 0.17, 0.265, 0.792),
 }
 MAX_INTENSITY = 1e9  # limit of a quantile in a file; no device writes larger intensities
-QUANTILES_KEY = "intensity_quantiles"  # key of the quantiles in a part's training record
-MATCHED_KEY = "match_intensity"  # key of `TrainedIntensity.is_matched` in a part's training record
-OPTIONAL_KEY = "optional_intensity"  # key of `TrainedIntensity.is_optional` in the same record
-NO_INTENSITY = [0.0] * len(PROBABILITIES)  # the quantiles of training scans without intensities
+NO_INTENSITY = (0.0,) * len(PROBABILITIES)  # the quantiles of training scans without intensities
 
 
 @dataclass(frozen=True)
@@ -54,11 +48,22 @@ class TrainedIntensity:
         is_optional: whether the networks learnt to label scans whose intensities are all zero.
         is_matched: whether the intensities of each scan are brought to this distribution. Networks
             trained on simulated scans need this: no real sensor has the simulated distribution.
+
+    Raises:
+        InputError: if no intensities have these quantiles.
     """
 
-    quantiles: Sequence[float]
+    quantiles: tuple[float, ...]
     is_optional: bool = False
     is_matched: bool = False
+
+    def __post_init__(self) -> None:
+        is_without = self.quantiles == NO_INTENSITY and not self.is_matched
+        if not is_without and not are_quantiles(self.quantiles):
+            raise InputError(
+                f"expected {len(PROBABILITIES)} quantiles of the intensities, ascending and not "
+                f"all equal, found {shown(list(self.quantiles))}; train or export again"
+            )
 
     @property
     def are_fractions(self) -> bool:
@@ -80,84 +85,8 @@ class TrainedIntensity:
         return np.interp(draws, PROBABILITIES, self.quantiles).astype(np.float32)
 
 
-def network_records(training: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the names and the training records of the networks that have one."""
-    for part in ("range_net", "polar_net"):
-        record = training.get(part)
-        if isinstance(record, Mapping):
-            yield part, record
-
-
-def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntensity | None:
-    """Return the intensities that weights were trained with, or None if these are unknown.
-
-    Args:
-        training: the training records of the weights by part.
-        sensor: name of the sensor that the weights were trained for.
-
-    Raises:
-        InputError: if a record has wrong quantiles.
-    """
-    quantiles: Sequence[float] | None = SIMULATED_QUANTILES.get(sensor)
-    optional = []
-    matched = []
-    for part, record in network_records(training):
-        carried = record.get(QUANTILES_KEY)
-        if carried == NO_INTENSITY and record.get(MATCHED_KEY) is not True:
-            quantiles = NO_INTENSITY
-        elif carried:
-            quantiles = check_quantiles(carried, f"the training record of {part}")
-
-        optional.append(_is_optional(record))
-        matched.append(record.get(MATCHED_KEY) is True)
-
-    if quantiles is None:
-        return None
-    return TrainedIntensity(
-        quantiles,
-        is_optional=bool(optional) and all(optional),
-        is_matched=bool(matched) and all(matched),
-    )
-
-
-def _is_optional(record: Mapping[str, Any]) -> bool:
-    """Return whether the training of a record taught a network to do without intensities."""
-    if isinstance(record.get(OPTIONAL_KEY), bool):
-        return bool(record[OPTIONAL_KEY])
-
-    # Records of earlier versions have only the share of scans without intensities.
-    augment = record.get("augment")
-    share = augment.get("no_intensity") if isinstance(augment, Mapping) else None
-    return isinstance(share, (int, float)) and share >= BLIND_SHARE
-
-
-def adapt_intensity(scan: Scan, trained: TrainedIntensity | None) -> Scan:
-    """Return a scan with the intensities that the networks take.
-
-    Everything that segments scans calls this function.
-
-    Raises:
-        InputError: if `check_intensity` raises it.
-    """
-    if trained is None or trained.are_fractions:
-        scan = check_intensity(scan)
-    return match_scan(scan, trained)
-
-
-def simulated_intensity(sensor: str) -> TrainedIntensity:
-    """Return the intensities to which the scans of a simulated sensor are brought in training."""
-    return TrainedIntensity(SIMULATED_QUANTILES[sensor], is_matched=True)
-
-
-def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
-    """Return a scan whose intensities have the distribution of a training.
-
-    The scan is returned unchanged if the training does not need this
-    (`TrainedIntensity.is_matched`), or if its intensities are constant.
-    """
-    if trained is None or not trained.is_matched:
-        return scan
-
+def match_scan(scan: Scan, trained: Sequence[float]) -> Scan:
+    """Return a scan whose intensities have the quantiles of a training; constant ones stay."""
     valid = scan.valid
     intensity = scan.points[valid, 3]
     quantiles = quantiles_of(intensity)
@@ -165,7 +94,7 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
         return scan
 
     points = scan.points.copy()
-    levels, becomes = matching(quantiles, trained.quantiles)
+    levels, becomes = matching(quantiles, trained)
     points[valid, 3] = np.interp(intensity, levels, becomes)
     return dataclasses.replace(scan, points=points)
 
@@ -188,33 +117,15 @@ def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarra
     return levels, np.clip(becomes, 0, 1)
 
 
-def are_quantiles(values: Any) -> TypeGuard[list[float]]:
-    """Return whether a value of a file is a list of quantiles at `PROBABILITIES`, not constant."""
-    if not isinstance(values, list) or len(values) != len(PROBABILITIES):
+def are_quantiles(values: Sequence[float]) -> bool:
+    """Return whether values may be the quantiles of intensities that are not all equal."""
+    if len(values) != len(PROBABILITIES):
         return False
     are_numbers = all(type(value) in (int, float) for value in values)
     if not are_numbers or not all(0 <= value < MAX_INTENSITY for value in values):
         return False  # NaN fails this check as well
     is_increasing = bool((np.diff(values) >= 0).all())
     return is_increasing and not is_constant(values)
-
-
-def check_quantiles(values: Any, source: str) -> list[float]:
-    """Return the quantiles in a file, after a check.
-
-    Args:
-        values: the value in the file.
-        source: where it stands, for the message.
-
-    Raises:
-        InputError: if `are_quantiles` is false.
-    """
-    if not are_quantiles(values):
-        raise InputError(
-            f"{source}: expected {len(PROBABILITIES)} quantiles of the intensities, ascending and "
-            f"not all equal, found {shown(values)}; train or export again"
-        )
-    return values
 
 
 def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:

@@ -1,15 +1,16 @@
-"""Measure the lasers of a sensor in one of its scans: their number and their field of view."""
+"""Measure a sensor in its scans: the number of its lasers, its field of view, its height."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amvnet.scan import Scan
 from amvnet.sensors.ground import MIN_DISTANCE, find_ground
 from amvnet.sensors.lidars import Sensor
 
@@ -115,6 +116,42 @@ def measure_lasers(points: np.ndarray, ring: np.ndarray | None = None) -> Sensor
     down, up = np.percentile(elevations(xyz[is_distant]), FOV_PERCENTILES)
     beams = None if ring is None else len(np.unique(ring))
     return SensorGeometry(beams, float(up), float(down))
+
+
+def measure_sensor(scans: Iterable[Scan]) -> SensorGeometry:
+    """Return the medians of the measures of a sensor in some scans, with three digits.
+
+    If the scans have rings, the field of view ends at the highest and at the lowest laser.
+    """
+    measured = []
+    for scan in scans:
+        points = scan.points[scan.valid, :3].astype(np.float64)
+        ring = None if scan.ring is None else scan.ring[scan.valid]
+        if len(points):
+            measured.append(_with_laser_ends(measure(points, ring), points, ring))
+
+    known = SensorGeometry.median(measured).known()
+    return SensorGeometry(**{key: round(value, 3) for key, value in known.items()})
+
+
+def _with_laser_ends(
+    geometry: SensorGeometry, points: np.ndarray, ring: np.ndarray | None
+) -> SensorGeometry:
+    """Return the geometry whose field of view ends at the highest and the lowest laser.
+
+    A laser's elevation is the median over its points.
+    """
+    if ring is None or geometry.fov_up is None:
+        return geometry
+    # Sensors report lost returns as points near the origin, at any elevation.
+    is_distant = np.hypot(points[:, 0], points[:, 1]) > MIN_DISTANCE
+    elevation = elevations(points[is_distant])
+    ring = ring[is_distant]
+
+    ends = [float(np.median(elevation[ring == laser])) for laser in (ring.min(), ring.max())]
+    if min(ends) == max(ends):
+        return geometry
+    return dataclasses.replace(geometry, fov_up=max(ends), fov_down=min(ends))
 
 
 def elevations(xyz: NDArray[np.floating]) -> NDArray[np.floating]:

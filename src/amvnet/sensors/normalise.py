@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,10 +15,11 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import Scan
+from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.frame import Frame
-from amvnet.sensors.intensity import IntensityMap, TrainedIntensity, intensity_map
+from amvnet.sensors.intensity import IntensityMap, intensity_map
 from amvnet.sensors.lasers import SensorGeometry, elevations
-from amvnet.sensors.lidars import KNOWN_SENSORS, Sensor
+from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.measure import (
     MEASURED_SCANS,
     Estimate,
@@ -32,30 +32,6 @@ from amvnet.sensors.measure import (
 # Largest height of a sensor on a vehicle, metres. A larger height may be in feet.
 MAX_SENSOR_HEIGHT = 4.5
 MAX_OUTSIDE_SHARE = 0.16  # limit of the share of the points outside a field of view that suffices
-
-
-@dataclass(frozen=True)
-class Expectation:
-    """The scans that some weights expect.
-
-    Attributes:
-        view: the range view of the weights.
-        sensor: what is known about the sensor that the weights were trained for
-            (`trained_sensor`).
-        intensity: the intensities that the weights were trained with, or None if these are unknown.
-        as_is: whether the weights were trained on scans that were not normalised. Scans with the
-            same field of view then keep the training's rows, however many points lie outside it.
-    """
-
-    view: RangeViewConfig
-    sensor: Sensor
-    intensity: TrainedIntensity | None = None
-    as_is: bool = False
-
-    @property
-    def lasers(self) -> SensorGeometry:
-        """The geometry of the sensor that the weights were trained for."""
-        return SensorGeometry().override(self.sensor)
 
 
 def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> Scan:
@@ -109,8 +85,7 @@ def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expecta
     if expected.lasers.field_of_view is None or is_named or lasers.is_like(expected.lasers):
         return line
 
-    sheet = KNOWN_SENSORS.get(trained.name)
-    name = trained.name if sheet and sheet.beams == trained.beams else "a sensor"
+    name = trained.name or "a sensor"
     return (
         f"{line}; the weights were trained for {name} ({describe_lasers(expected.lasers)}) "
         "and have seen no such sensor"
@@ -200,8 +175,8 @@ class Normaliser:
         """Return a normaliser for the same weights and the scans of a described sensor."""
         return Normaliser(self.expected, sensor, self._report)
 
-    def target(self) -> dict[str, float]:
-        """Return the sensor's measures for weights that are trained on the normalised scans.
+    def target(self) -> SensorGeometry:
+        """Return the geometry of a sensor for weights that are trained on the normalised scans.
 
         The height is the height to which the scans are moved. The lasers are the scans' lasers. If
         the rows of the range image are rings, they are the lasers that decide the rows instead.
@@ -217,7 +192,7 @@ class Normaliser:
             if self.expected.view.rows != "ring" or lasers.field_of_view is None:
                 lasers = measured.lasers.override(self.sensor)
 
-        return dataclasses.replace(lasers, height=height).known()
+        return dataclasses.replace(lasers, height=height)
 
     def _check_height(self, cloud: Cloud, frame: Frame) -> None:
         """Check that the ground is not too deep for coordinates in metres.
@@ -318,7 +293,7 @@ def _rows(
     """
     ring = scan.ring if expected.view.rows == "ring" else None
     # If no data sheet describes the lasers, they may be unevenly spaced.
-    is_trusted = ring is not None and expected.sensor.name not in KNOWN_SENSORS
+    is_trusted = ring is not None and not expected.sensor.name
     if view is None or is_trusted:
         return None
 
@@ -340,12 +315,12 @@ def _rows_by_laser(
     the training's lasers.
     """
     view = expected.view
-    if not view.lasers or not lasers.has_ends_of(expected.lasers):
+    if view.rows != "laser" or not lasers.has_ends_of(expected.lasers):
         return None
 
     ring = cloud.ring
     if ring is None:
-        ring = lasers_by_order(cloud.xyz, view.lasers)
+        ring = lasers_by_order(cloud.xyz, view.height)
     if ring is None or not view.has_laser_per_row(ring.max()):
         return None
     return view.height - 1 - ring

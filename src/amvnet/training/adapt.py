@@ -24,7 +24,6 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import network_records
 from amvnet.training.plan import Plan, sized_by_init
 from amvnet.training.run import train
 from amvnet.training.run_folder import check_folder, is_run
@@ -76,8 +75,6 @@ class TaughtScans(Dataset):
     def __init__(self, scans: Sequence[InputScan], folder: Path, weights: Weights) -> None:
         super().__init__(folder, weights.taxonomy)
         self._scans = {label_path(scan): scan for scan in scans}
-        # The scans are normalised to what the weights expect, and so will be the scans to label.
-        _, self.sensor_record = next(network_records(weights.training), ("", {}))
 
     def official(self, split: str) -> tuple[str, ...]:
         """Return the recordings; all of them train."""

@@ -14,10 +14,8 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from amvnet.progress import Reporter
-from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import PART_OF, SETTINGS, stage_record, stage_settings, write_yaml
-from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights, part_state, save
 
 
@@ -103,17 +101,13 @@ class KeepWeights(Callback):
     `own_miou` if it has one. If nothing is validated, they are the last ones.
     """
 
-    def __init__(
-        self, plan: Plan, name: str, weights: Weights, intensity: TrainedIntensity | None
-    ) -> None:
+    def __init__(self, plan: Plan, name: str, weights: Weights) -> None:
+        assert plan.expects is not None
         self.folder = plan.out / name
         self.part = PART_OF[name]
-        self.weights = weights
+        self.weights = dataclasses.replace(weights, expects=plan.expects)
         self.settings = stage_settings(plan, name, weights)
-        self.record: dict[str, Any] = {}
-        if plan.processes.first:  # other processes do not write
-            sensor = sensor_record(plan.scans.dataset, plan.scans.train, intensity)
-            self.record = stage_record(plan, self.settings, sensor)
+        self.record = stage_record(plan, self.settings)
         self.started = time.monotonic()  # unlike the system's clock, it is never set back
         self.seconds_before = 0.0  # the time of earlier calls, of which this one continues the last
         self.highest = -1.0  # mIoU of the best weights so far, in [0, 1]

@@ -17,7 +17,6 @@ from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.point_head import PointHead
-from amvnet.sensors.intensity import trained_intensity
 from amvnet.training.head_points import HeadBatch, HeadPoints, PointGatherer, PointSampler
 from amvnet.training.plan import Plan
 from amvnet.training.stage import Loaders, Stage, fit
@@ -113,19 +112,16 @@ def train_head(plan: Plan, weights: Weights) -> None:
     config = training.head
     folder = plan.out / "head"
 
-    # Other models have scored the scans already. Networks expect intensities as in their training.
-    intensity = None
-    if plan.scores is None:
+    if plan.scores is None:  # other models have not scored the scans already
         for part in BOTH_NETWORKS:
             if part not in weights.parts:
                 raise InputError(
                     f"expected trained networks for the head, found no {part}; train it, or give "
                     "--init"
                 )
-        intensity = trained_intensity(weights.training, weights.sensor)
 
     # Gather the uncertain points of all scans, with their scores and neighbours.
-    gatherer = PointGatherer(plan, weights, intensity)
+    gatherer = PointGatherer(plan, weights)
     train = gatherer.gather(
         plan.scans.train, folder / "train", config.views, tau=config.tau, report=plan.report
     )
@@ -141,7 +137,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
         taxonomy=plan.scans.dataset.taxonomy,
         processes=plan.processes,
     )
-    fit(stage, plan, _make_loaders(plan, train, val), weights, intensity)
+    fit(stage, plan, _make_loaders(plan, train, val), weights)
 
     # Remove the gathered points, which take much space, when no process needs them any more.
     plan.processes.wait()

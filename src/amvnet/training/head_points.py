@@ -27,7 +27,6 @@ from amvnet.models.views.points import PointBatch
 from amvnet.progress import Reporter, Tenths, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes, device_of
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.augment import disturb
 from amvnet.training.loaders import EpochOrder, Key, ScanSet, collate
 from amvnet.training.plan import Plan
@@ -153,14 +152,10 @@ class PointGatherer:
         plan: the plan of the run. All its processes must see the folder of the points. If it has
             the scores of two other models, these are used instead of the networks.
         weights: the weights of the networks.
-        intensity: the distribution of intensities that the networks learnt. The intensities of each
-            scan are matched to it before the augmentation. It is None for the scores of other
-            models.
     """
 
     plan: Plan
     weights: Weights
-    intensity: TrainedIntensity | None = None
 
     def gather(
         self,
@@ -190,15 +185,9 @@ class PointGatherer:
         if self.plan.scores is not None:
             views = 0
         augment = training.augment if views > 0 else None
+        assert self.plan.expects is not None
         dataset = self.plan.scans.dataset
-        scans = ScanSet(
-            dataset,
-            records,
-            augment,
-            training.seed,
-            intensity=self.intensity,
-            lasers=self.weights.model.range_view.lasers,
-        )
+        scans = ScanSet(dataset, records, self.plan.expects, augment, training.seed)
         keys = list(product(range(max(views, 1)), range(len(scans))))
         least = max(2, self.plan.processes.size)  # batch norm needs two points, a process one
 

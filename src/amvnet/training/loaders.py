@@ -12,12 +12,11 @@ from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.laser_order import with_lasers
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import TrainedIntensity, match_scan
+from amvnet.sensors.expectation import Expectation
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
 Key = tuple[int, int]  # the epoch, and the index of a scan in the list of scans
@@ -52,29 +51,24 @@ class ScanSet(data.Dataset[Scan]):
     Args:
         dataset: the dataset that reads the scans.
         records: the scans.
+        expects: what the networks expect of a scan, before its augmentation.
         augment: how the scans are augmented, or None to leave them unchanged.
         seed: the seed of the augmentation.
-        intensity: the distribution to which the intensities of each scan are matched before its
-            augmentation.
-        lasers: number of lasers to look for in scans without rings (`with_lasers`); 0 looks for
-            none.
     """
 
     def __init__(
         self,
         dataset: Dataset,
         records: Sequence[ScanRecord],
+        expects: Expectation,
         augment: AugmentConfig | None = None,
         seed: int = 0,
-        intensity: TrainedIntensity | None = None,
-        lasers: int = 0,
     ) -> None:
         self.dataset = dataset
         self.records = list(records)
+        self.expects = expects
         self.augment = augment
         self.seed = seed
-        self.intensity = intensity
-        self.lasers = lasers
 
         classes = enumerate(dataset.taxonomy.classes, start=1)
         self.pasted = [train_id for train_id, name in classes if name in PASTED_CLASSES]
@@ -124,10 +118,8 @@ class ScanSet(data.Dataset[Scan]):
                 f"{scan.name}: expected at least two valid points to train with, found {valid}; "
                 "leave the scan out"
             )
-        # Do this before the augmentation, which changes the order and the intensity of the points.
-        if self.lasers:
-            scan = with_lasers(scan, self.lasers)
-        return match_scan(scan, self.intensity)
+        # Before the augmentation, which changes the order and the intensities of the points.
+        return self.expects.prepare(scan)
 
 
 class EpochOrder(data.Sampler[Any]):

@@ -20,7 +20,6 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import counted
-from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
 from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
@@ -34,7 +33,7 @@ from amvnet.training.losses import (
     rival_classes,
 )
 from amvnet.training.muon import Muon
-from amvnet.training.plan import Plan, learnt_intensity
+from amvnet.training.plan import Plan
 from amvnet.training.stage import HALF, MIXED, Loaders, Stage, fit, precision_of
 from amvnet.weights.file import Weights
 
@@ -282,8 +281,7 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     """
     config = getattr(plan.recipe.training, name)
     model = plan.build(weights)
-    intensity = intensity_of(plan, weights)
-    loaders = make_loaders(plan, config, intensity)
+    loaders = make_loaders(plan, config)
     # The class weights of the loss (section 4.2 of the paper).
     loss_weights = None
     if config.class_weights:
@@ -293,7 +291,7 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     for line in _notes(plan, name):
         plan.report(line)
     try:
-        fit(stage, plan, loaders, weights, intensity)
+        fit(stage, plan, loaders, weights)
     except torch.OutOfMemoryError:
         raise InputError(
             f"{name}: expected steps that fit into the GPU's memory, found {config.batch} scans in "
@@ -369,9 +367,7 @@ def make_stage(
     return PolarStage(model.polar_view, net, **shared)
 
 
-def make_loaders(
-    plan: Plan, config: NetworkTraining, intensity: TrainedIntensity | None
-) -> Loaders:
+def make_loaders(plan: Plan, config: NetworkTraining) -> Loaders:
     """Return the loaders of training batches and of validation batches."""
     training = plan.recipe.training
     scans = plan.scans
@@ -379,25 +375,11 @@ def make_loaders(
 
     # The number of scans that one process takes at a time.
     batch = config.batch // config.accumulate // plan.processes.size
-    scan_options: dict[str, Any] = {
-        "intensity": intensity,
-        "lasers": plan.recipe.model.range_view.lasers,
-    }
-    train_set = ScanSet(scans.dataset, scans.train, training.augment, training.seed, **scan_options)
+    assert plan.expects is not None
+    expects = plan.expects
+    train_set = ScanSet(scans.dataset, scans.train, expects, training.augment, training.seed)
     train = make_loader(train_set, batch, shuffle=True, **shared)
     if not scans.val:
         return train, None
-    val_set = ScanSet(scans.dataset, scans.val, **scan_options)
+    val_set = ScanSet(scans.dataset, scans.val, expects)
     return train, make_loader(val_set, 1, shuffle=False, **shared)
-
-
-def intensity_of(plan: Plan, weights: Weights) -> TrainedIntensity | None:
-    """Return the intensities that the network learns, as `predict` takes them from its record.
-
-    If it is None, intensities stay unchanged.
-    """
-    first = plan.scans.dataset.members[0]
-    known = trained_intensity(weights.training, weights.sensor)
-    if isinstance(first, SimulatedStreets):
-        known = simulated_intensity(first.sensor)
-    return learnt_intensity(known, plan.recipe)

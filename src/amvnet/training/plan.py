@@ -19,15 +19,17 @@ from amvnet.data.datasets.own import OwnScans
 from amvnet.data.datasets.select import TrainingScans, all_to_train
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, describe_difference
 from amvnet.errors import InputError
-from amvnet.inference.reading import expectation_of, normalised
+from amvnet.inference.reading import normalised
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Reporter, counted, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
-from amvnet.sensors.intensity import BLIND_SHARE, TrainedIntensity
+from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.normalise import Normaliser
-from amvnet.sensors.record import MAX_MEASURED_RECORDINGS
+from amvnet.training.expectation import NETWORK_OF, expected_before
 from amvnet.weights.file import Weights, load
+
+MAX_MEASURED_RECORDINGS = 20  # largest number of a user's recordings that are measured
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Plan:
             from them instead of from the scores of the networks.
         also_read: files besides the scans that the run reads. Entries that name no file are
             ignored.
+        expects: what the networks expect of a scan, and the weights will say. By default, the
+            training measures it on its scans before the first stage (`expected_after`).
         class_counts: (K,) number of points of each class in the training scans of an epoch. The
             check of the scans sets it.
         taught: (M, K) bool, whether each of the M datasets teaches each class (`rival_classes`),
@@ -69,6 +73,7 @@ class Plan:
     processes: Processes = ALONE
     scores: ScorePair | None = None
     also_read: Sequence[Path | str | None] = ()
+    expects: Expectation | None = None
     class_counts: np.ndarray | None = None
     taught: np.ndarray | None = None
     initial: Mapping[str, str] = field(default_factory=dict)
@@ -221,24 +226,22 @@ def open_for_training(
     Raises:
         InputError: if the dataset cannot be opened (`open_dataset`).
     """
-    dataset = open_dataset(data)
-    weights = Weights(recipe.model, dataset.taxonomy, recipe.sensor)
-    records = _earlier_records(out) if init is None else init.training
-    weights = dataclasses.replace(weights, training=records)
-    expected = expectation_of(weights)
-    # A network that stays as it is does not learn to do without intensities.
-    if {"rv", "bev"} <= set(stages):
-        intensity = learnt_intensity(expected.intensity, recipe)
-        expected = dataclasses.replace(expected, intensity=intensity)
+    begun = _earlier(out) if init is None else [init]
+    known = begun[-1].expects if begun else Expectation.of_sensor(recipe.sensor)
+    parts = {part for weights in begun for part in weights.parts}
+    expected = expected_before(known, parts, recipe, stages)
 
-    opened = normalised(dataset, Normaliser(expected, report=report))
+    opened = normalised(open_dataset(data), Normaliser(expected, report=report))
     if isinstance(opened, OwnScans) and isinstance(opened.normalise, Normaliser):
         _report_recordings(opened, opened.normalise, report)
     return opened
 
 
 def _report_recordings(dataset: OwnScans, normaliser: Normaliser, report: Reporter) -> None:
-    """Report what is assumed of the first recordings, once and not in every process that reads."""
+    """Measure the first recordings, and report what is assumed of them.
+
+    The processes that read them report nothing.
+    """
     recordings = dataset.recordings()
     for source, scans in list(recordings.items())[:MAX_MEASURED_RECORDINGS]:
         with suppress(InputError):  # the check of the scans reports broken ones
@@ -249,28 +252,11 @@ def _report_recordings(dataset: OwnScans, normaliser: Normaliser, report: Report
     normaliser.quiet()
 
 
-def learnt_intensity(known: TrainedIntensity | None, recipe: Recipe) -> TrainedIntensity | None:
-    """Return the intensities that networks have learnt after a training.
-
-    If the augmentation often hides the intensities, the networks learn to do without them.
-
-    Args:
-        known: the intensities that the networks have learnt before, or None if these are unknown.
-        recipe: the recipe of the training.
-    """
-    if known is None or recipe.training.augment.no_intensity < BLIND_SHARE:
-        return known
-    return dataclasses.replace(known, is_optional=True)
-
-
-def _earlier_records(out: Path) -> Mapping[str, Any]:
-    """Return the training records of the networks that earlier calls have written into a folder."""
-    paths = [out / f"{name}.safetensors" for name in ("rv/last", "bev/last")]
+def _earlier(out: Path) -> list[Weights]:
+    """Return the weights of the networks that earlier calls have written into a folder."""
+    paths = [out / name / "last.safetensors" for name in NETWORK_OF]
     paths = [path for path in paths if path.is_file()]
     whole = out / "weights.safetensors"
     if not paths and whole.is_file():  # the networks of --init
         paths = [whole]
-    records: dict[str, Any] = {}
-    for path in paths:
-        records |= load(path).training
-    return records
+    return [load(path) for path in paths]

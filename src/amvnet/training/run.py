@@ -12,8 +12,10 @@ import lightning as L
 from amvnet.config.nested import flat, to_dict
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
+from amvnet.sensors.expectation import Expectation
 from amvnet.training.checking import check_data, keep_counts
 from amvnet.training.curves import draw_curves, read_curves
+from amvnet.training.expectation import expected_after
 from amvnet.training.head import train_head
 from amvnet.training.networks import train_network
 from amvnet.training.plan import Plan
@@ -72,8 +74,9 @@ def _train_stages(plan: Plan, stage: str, init: Weights | None) -> Path:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
         _check_initial(plan, name)
     counts, taught = check_data(plan)
-    plan = dataclasses.replace(plan, class_counts=counts, taught=taught)
-    plan.processes.wait()
+    plan.processes.wait()  # until all streets of the first epoch are simulated
+    expects = plan.expects or expected_after(plan, weights)
+    plan = dataclasses.replace(plan, class_counts=counts, taught=taught, expects=expects)
     if plan.processes.first:
         write_record(plan, stage, init)
     keep_counts(plan, counts)
@@ -147,7 +150,9 @@ def first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> W
 
     If `init` has other classes, its parts are only taken for the stages to train.
     """
-    weights = Weights(plan.recipe.model, plan.scans.dataset.taxonomy, plan.recipe.sensor)
+    sensor = plan.recipe.sensor
+    expects = Expectation.of_sensor(sensor)
+    weights = Weights(plan.recipe.model, plan.scans.dataset.taxonomy, sensor, expects)
     for name in _stages_of_folder(plan):
         part = PART_OF[name]
         if init is None or part not in init.parts:

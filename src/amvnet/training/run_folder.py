@@ -20,12 +20,13 @@ from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, parse_yaml, remove_unfinished
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.outputs import check_not_read
+from amvnet.training.expectation import NETWORK_OF
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights, load
 from amvnet.weights.parts import SIZES, replace_part
 
 # The stages in order, and the part of the weights that each of them trains.
-PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
+PART_OF = {**NETWORK_OF, "head": "point_head"}
 
 # Names of files in the folder of a stage.
 LAST = "last.ckpt"  # the checkpoint that --resume continues from
@@ -185,12 +186,11 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
     return settings
 
 
-def stage_record(plan: Plan, settings: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
+def stage_record(plan: Plan, settings: dict[str, Any]) -> dict[str, Any]:
     """Return the record of a stage's training, which is stored in its weights.
 
     Args:
         settings: the settings of the stage, as `stage_settings` returns them.
-        sensor: the record of the sensor, as `sensor_record` returns it.
     """
     scans = plan.scans
     scores = {"scores": settings["scores"]} if "scores" in settings else {}
@@ -199,7 +199,6 @@ def stage_record(plan: Plan, settings: dict[str, Any], sensor: dict[str, Any]) -
         "sequences": sequence_names(scans.train),
         "validated_on": sequence_names(scans.val),
         "scans": len(scans.train),
-        **sensor,
         **scores,
     }
 

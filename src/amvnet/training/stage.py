@@ -39,7 +39,6 @@ from amvnet.models.views.points import PointBatch
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes, device_of, environment
 from amvnet.runtime.memory import keep_freed_memory
-from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import LAST, is_finished
@@ -216,13 +215,7 @@ class WholeCheckpoints(TorchCheckpointIO):
             part.write_bytes(content.getbuffer())
 
 
-def fit(
-    stage: Stage,
-    plan: Plan,
-    loaders: Loaders,
-    weights: Weights,
-    intensity: TrainedIntensity | None,
-) -> None:
+def fit(stage: Stage, plan: Plan, loaders: Loaders, weights: Weights) -> None:
     """Train a stage in its folder of the run, and write its weights after each epoch.
 
     Args:
@@ -230,7 +223,6 @@ def fit(
         plan: the plan of the run.
         loaders: the batches to learn from and to validate with.
         weights: the weights that the training begins with.
-        intensity: the distribution to which the intensities of the scans are matched.
 
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
@@ -271,7 +263,7 @@ def fit(
         limit_val_batches=0 if val is None else None,
         accumulate_grad_batches=getattr(stage.config, "accumulate", 1),
         gradient_clip_val=getattr(stage.config, "clip", None),
-        callbacks=_callbacks(stage, plan, KeepWeights(plan, stage.name, weights, intensity)),
+        callbacks=_callbacks(stage, plan, KeepWeights(plan, stage.name, weights)),
         default_root_dir=folder,
         logger=TensorBoardLogger(folder, name="", version=""),
         enable_progress_bar=plan.bars and plan.processes.first,

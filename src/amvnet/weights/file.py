@@ -27,6 +27,7 @@ from amvnet.errors import InputError, did_you_mean, reason_of, shown
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
+from amvnet.sensors.expectation import Expectation
 from amvnet.weights import hub
 
 PARTS = ("range_net", "polar_net", "point_head")  # parts of the method, as `AMVNet` names them
@@ -41,7 +42,14 @@ LONGEST_DESCRIPTION = 10_000_000  # limit in characters; built-in weights have 6
 MAX_PARAMETERS = 500_000_000  # limit for a model; the paper's model has about 60 million
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
-_FIELD_TYPES = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
+_FIELD_TYPES = {
+    "model": dict,
+    "taxonomy": dict,
+    "sensor": str,
+    "expects": dict,
+    "training": dict,
+    "metrics": dict,
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -52,6 +60,7 @@ class Weights:
         model: sizes of the views, networks and head.
         taxonomy: the classes.
         sensor: name of the sensor that they were trained for; "" if unknown.
+        expects: what the networks expect of a scan; its view is that of `model`.
         tensors: the parameters by name; each name begins with its part: "range_net.",
             "polar_net." or "point_head.".
         training: for each part, a record of how it was trained.
@@ -61,9 +70,15 @@ class Weights:
     model: ModelConfig
     taxonomy: Taxonomy
     sensor: str = ""
+    expects: Expectation = field(default_factory=Expectation)
     tensors: Mapping[str, Tensor] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     metrics: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        # Whoever changes the view of the model need not think of the copy in `expects`.
+        expects = dataclasses.replace(self.expects, view=self.model.range_view)
+        object.__setattr__(self, "expects", expects)
 
     def __repr__(self) -> str:
         sensor = f" for {self.sensor}" if self.sensor else ""
@@ -80,8 +95,7 @@ class Weights:
     @property
     def usual_uncertain(self) -> float:
         """The share of uncertain points in the validation, in [0, 1]; else `USUAL_UNCERTAIN`."""
-        metrics = self.metrics.get("point_head")
-        share = metrics.get(UNCERTAIN) if isinstance(metrics, Mapping) else None
+        share = self.metrics.get("point_head", {}).get(UNCERTAIN)
         if isinstance(share, int | float) and 0 <= share <= 1:
             return float(share)
         return USUAL_UNCERTAIN
@@ -175,6 +189,7 @@ def save(weights: Weights, path: Path | str) -> Path:
         "model": to_dict(weights.model),
         "taxonomy": weights.taxonomy.to_dict(),
         "sensor": weights.sensor,
+        "expects": weights.expects.to_dict(),
         "training": weights.training,
         "metrics": weights.metrics,
     }
@@ -240,10 +255,12 @@ def _from_description(text: str) -> Weights:
                     "train again"
                 )
 
+    model = from_dict(ModelConfig, description["model"], "model")
     return Weights(
-        model=from_dict(ModelConfig, description["model"], "model"),
+        model=model,
         taxonomy=Taxonomy.from_dict(description["taxonomy"]),
         sensor=description["sensor"],
+        expects=Expectation.from_dict(description["expects"], model.range_view),
         training=description["training"],
         metrics=description["metrics"],
     )

@@ -25,6 +25,8 @@ SIZES = {
 def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
     """Return weights in which one part, its sizes and its records come from other weights.
 
+    They expect the scans of the other weights, to which the part was trained last.
+
     Args:
         weights: the weights that keep their other parts.
         part: "range_net", "polar_net" or "point_head".
@@ -56,6 +58,7 @@ def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
 
     return dataclasses.replace(
         resized(weights, part, other.model),
+        expects=other.expects,
         tensors=tensors,
         training=_with_entry(weights.training, other.training, part),
         metrics=_with_entry(weights.metrics, other.metrics, part),
@@ -99,8 +102,7 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
         seed: the seed of the new parameters.
 
     Returns:
-        The weights, without metrics, and the names of the new parameters. The records of the
-        earlier training stay, because they say what scans the networks take.
+        The weights, without metrics, and the names of the new parameters.
     """
     with torch.device("meta"):  # takes no memory
         few = build_amvnet(weights.model, 1).state_dict()

@@ -62,14 +62,14 @@ def adapt(
     from amvnet.data.datasets.simulated import SimulatedStreets
     from amvnet.inference.drive import find_poses
     from amvnet.inference.listing import list_inputs
-    from amvnet.inference.reading import normaliser_for
+    from amvnet.sensors.normalise import Normaliser
     from amvnet.training.adapt import adapt as adapt_weights
     from amvnet.training.adapt import recipe_for
     from amvnet.training.plan import Plan
     from amvnet.weights.file import load
 
     loaded = load(weights)
-    normaliser = normaliser_for(loaded, sensor_choice.parse(), report)
+    normaliser = Normaliser(loaded.expects, sensor_choice.parse(), report)
     scans, _ = list_inputs(inputs, choice.parse(), loaded.taxonomy, normaliser)
     recipe = recipe_for(loaded, epochs, streets, seed)
     drives = None
@@ -94,6 +94,7 @@ def adapt(
             report=report,
             bars=on_terminal(),
             also_read=(*inputs, weights, poses, val),
+            expects=loaded.expects,  # to which the scans are normalised
         )
 
     score = None if val is None else _score_on(val, val_sequences, loaded)
@@ -109,9 +110,10 @@ def _score_on(
     """Return a function that returns the mIoU of a segmenter on labelled scans."""
     from amvnet.data.datasets.open import open_dataset
     from amvnet.evaluation.scoring import evaluate, label_by_weights
-    from amvnet.inference.reading import normalised, normaliser_for
+    from amvnet.inference.reading import normalised
+    from amvnet.sensors.normalise import Normaliser
 
-    dataset = normalised(open_dataset(val, weights.taxonomy), normaliser_for(weights))
+    dataset = normalised(open_dataset(val, weights.taxonomy), Normaliser(weights.expects))
     records = LabelledChoice("all", sequences).records(dataset)
 
     def score(segmenter: Segmenter) -> float:

@@ -52,8 +52,9 @@ def analyze(
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
-    from amvnet.inference.reading import normalised, normaliser_for
+    from amvnet.inference.reading import normalised
     from amvnet.outputs import check_outputs
+    from amvnet.sensors.normalise import Normaliser
     from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
     from amvnet.training.plan import Plan
     from amvnet.weights.file import load
@@ -65,7 +66,7 @@ def analyze(
             "give both or neither"
         )
     loaded = load(weights)
-    dataset = normalised(open_dataset(data, loaded.taxonomy), normaliser_for(loaded))
+    dataset = normalised(open_dataset(data, loaded.taxonomy), Normaliser(loaded.expects))
     records = choice.records(dataset)
 
     # Check the outputs and the training scans first: scoring takes long, and would be for nothing

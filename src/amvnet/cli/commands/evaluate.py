@@ -69,8 +69,9 @@ def evaluate(
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files, pictures_of
     from amvnet.files import make_folder
-    from amvnet.inference.reading import normalised, normaliser_for
+    from amvnet.inference.reading import normalised
     from amvnet.outputs import check_outputs
+    from amvnet.sensors.normalise import Normaliser
     from amvnet.weights.file import load
 
     def check_files(records: Sequence[ScanRecord]) -> None:
@@ -86,7 +87,7 @@ def evaluate(
     if weights is not None and predictions is None:
         loaded = load(weights)
         opened = open_dataset(data, loaded.taxonomy if mapping is None else None)
-        dataset = normalised(opened, normaliser_for(loaded))
+        dataset = normalised(opened, Normaliser(loaded.expects))
         records = choice.records(dataset)
         check_files(records)
         drives = _find_drives(time, dataset, records, processes.size)

@@ -53,8 +53,8 @@ def map(
     from amvnet.inference.drive import digest_of, find_poses
     from amvnet.inference.listing import list_inputs
     from amvnet.inference.map import SavedMap, describe_map, map_drive
-    from amvnet.inference.reading import normaliser_for
     from amvnet.outputs import check_outputs
+    from amvnet.sensors.normalise import Normaliser
     from amvnet.weights.file import load
 
     check_ending(out)
@@ -62,7 +62,7 @@ def map(
     if json is not None:
         outputs[json] = FIGURES
     loaded = load(weights)
-    normaliser = normaliser_for(loaded, sensor_choice.parse(), report)
+    normaliser = Normaliser(loaded.expects, sensor_choice.parse(), report)
     scans, _ = list_inputs([inputs], choice.parse(), loaded.taxonomy, normaliser)
     files = [path for scan in scans for path in scan.files]
     check_outputs(outputs, [*files, weights, poses], overwrite)

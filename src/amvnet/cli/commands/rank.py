@@ -31,17 +31,18 @@ def rank(
     """
     from amvnet.data.datasets.open import open_dataset
     from amvnet.files import make_folder
-    from amvnet.inference.reading import normalised, normaliser_for
+    from amvnet.inference.reading import normalised
     from amvnet.outputs import check_outputs
     from amvnet.ranking.label_errors import TABLE, write_clusters
     from amvnet.ranking.label_errors import rank as rank_records
+    from amvnet.sensors.normalise import Normaliser
     from amvnet.weights.file import load
 
     # Check this before any scan is scored, so that no time is wasted.
     check_outputs({out: TABLE}, [data, weights], overwrite)
     make_folder(out.parent)
     loaded = load(weights)
-    dataset = normalised(open_dataset(data, loaded.taxonomy), normaliser_for(loaded))
+    dataset = normalised(open_dataset(data, loaded.taxonomy), Normaliser(loaded.expects))
     records = choice.records(dataset, "all")
     segmenter = load_segmenter(loaded, "ensemble", compute)
 

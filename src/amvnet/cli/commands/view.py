@@ -45,7 +45,6 @@ def view(
     from amvnet.data.taxonomy import TAXONOMIES
     from amvnet.files import make_folder
     from amvnet.inference.listing import list_inputs
-    from amvnet.inference.reading import normaliser_for
     from amvnet.outputs import check_outputs
     from amvnet.sensors.normalise import Normaliser
     from amvnet.viewing.page import PAGE, open_page, place_for_page, write_page
@@ -72,7 +71,7 @@ def view(
     loaded = None if weights is None else load(weights)
     if loaded is not None:
         classes = loaded.taxonomy
-        normaliser = normaliser_for(loaded, sensor, report)
+        normaliser = Normaliser(loaded.expects, sensor, report)
 
     listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser)
     if labels is not None:

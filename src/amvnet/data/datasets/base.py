@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -53,9 +52,6 @@ class Dataset(ABC):
     """
 
     readers = 8  # threads that may read scans at the same time
-    # The training record of the weights to which the scans are normalised, or None if the sensor is
-    # to be measured.
-    sensor_record: Mapping[str, Any] | None = None
 
     def __init__(self, root: Path | str, taxonomy: Taxonomy, spec: str | None = None) -> None:
         self.root = Path(root)

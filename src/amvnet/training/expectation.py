@@ -1,0 +1,118 @@
+"""Decide what the networks of a training expect of a scan."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amvnet.config.schema import Recipe
+from amvnet.data.datasets.own import OwnScans
+from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.data.spacing import evenly_spaced
+from amvnet.errors import InputError
+from amvnet.scan import Scan
+from amvnet.sensors.expectation import Expectation, trained_sensor
+from amvnet.sensors.intensity import (
+    NO_INTENSITY,
+    SIMULATED_QUANTILES,
+    TrainedIntensity,
+    are_quantiles,
+    quantiles_of,
+)
+from amvnet.sensors.lasers import measure_sensor
+from amvnet.sensors.normalise import Normaliser
+from amvnet.weights.file import Weights
+
+if TYPE_CHECKING:
+    from amvnet.training.plan import Plan
+
+NETWORK_OF = {"rv": "range_net", "bev": "polar_net"}  # the network that a stage trains
+# Largest number of scans that are measured; it is enough for the mean height of simulated sensors.
+SAMPLED_SCANS = 60
+# Networks need no intensity if they were trained with this share of their scans without it.
+BLIND_SHARE = 0.2
+
+
+def expected_before(
+    known: Expectation, parts: Collection[str], recipe: Recipe, stages: Sequence[str]
+) -> Expectation:
+    """Return what networks expect, before the scans of their training are measured.
+
+    If the augmentation often hides the intensities, the networks learn to do without them. A
+    network that stays as it is does not.
+
+    Args:
+        known: what the weights expect that the training begins with.
+        parts: the parts of these weights.
+        recipe: the recipe of the training.
+        stages: the stages to train.
+    """
+    hides = recipe.training.augment.no_intensity >= BLIND_SHARE
+    trained = _networks(stages)
+    stay = not trained or set(NETWORK_OF.values()) & set(parts) - trained
+    intensity = known.intensity
+    if intensity is not None and hides and not stay:
+        intensity = dataclasses.replace(intensity, is_optional=True)
+    return dataclasses.replace(known, view=recipe.model.range_view, intensity=intensity)
+
+
+def expected_after(plan: Plan, weights: Weights) -> Expectation:
+    """Return what the networks of a plan expect after their training, measured on its scans.
+
+    Args:
+        plan: the plan, with its stages.
+        weights: the weights that the training begins with.
+    """
+    if set(NETWORK_OF.values()) & set(weights.parts) and not _networks(plan.stages):
+        return weights.expects  # a head takes what its networks take
+
+    first = plan.scans.dataset.members[0]
+    sampled = _sample(plan.scans)
+    known = weights.expects
+    as_is = True
+    geometry = measure_sensor(sampled)
+    if isinstance(first, OwnScans) and isinstance(first.normalise, Normaliser):
+        # The weights will get scans that are normalised in the same way.
+        known = first.normalise.expected or known
+        as_is = False
+        geometry = first.normalise.target()
+
+    intensity = known.intensity
+    is_optional = intensity is not None and intensity.is_optional
+    if isinstance(first, SimulatedStreets):
+        simulated = SIMULATED_QUANTILES[first.sensor]
+        intensity = TrainedIntensity(simulated, is_optional, is_matched=True)
+    elif intensity is None or (as_is and not intensity.is_matched):
+        quantiles = _mean_quantiles(sampled)
+        if quantiles == NO_INTENSITY or are_quantiles(quantiles):
+            intensity = TrainedIntensity(quantiles, is_optional)
+
+    sensor = trained_sensor(plan.recipe.sensor, geometry)
+    known = dataclasses.replace(known, sensor=sensor, intensity=intensity, as_is=as_is)
+    return expected_before(known, weights.parts, plan.recipe, plan.stages)
+
+
+def _networks(stages: Sequence[str]) -> set[str]:
+    """Return the parts of the networks that some stages train."""
+    return {NETWORK_OF[name] for name in stages if name in NETWORK_OF}
+
+
+def _sample(scans: TrainingScans) -> list[Scan]:
+    """Read some of the scans to train on, but no broken ones, which the training reports."""
+    sample = []
+    for record in evenly_spaced(scans.train, SAMPLED_SCANS):
+        with suppress(InputError):
+            sample.append(scans.dataset.read(record, labels=False))
+    return sample
+
+
+def _mean_quantiles(scans: Sequence[Scan]) -> tuple[float, ...]:
+    """Return the mean quantiles of the intensities of some scans; empty if no scan has any."""
+    quantiles = [quantiles_of(scan.points[scan.valid, 3]) for scan in scans]
+    known = [values for values in quantiles if values is not None]
+    return tuple(np.mean(known, axis=0).round(4).tolist()) if known else ()
