@@ -29,7 +29,7 @@ from amvnet.export import onnx as onnx_export
 from amvnet.export.onnx import describe_export
 from amvnet.models.methods import MethodName
 from amvnet.models.neighbours import nearest_others
-from amvnet.onnx_runner import DESCRIPTION, OnnxSegmenter, pool
+from amvnet.onnx_runner import DESCRIPTION, FORMAT, OnnxSegmenter, pool
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import (
     SIMULATED_QUANTILES,
@@ -346,7 +346,7 @@ def replace_range_net(folder: Path) -> None:
     [
         (remove("amvnet.json"), "amvnet.json"),
         (write("amvnet.json", "{"), "amvnet.json"),
-        (write("amvnet.json", "[]"), "format 2"),
+        (write("amvnet.json", "[]"), f"format {FORMAT}"),
         (write("amvnet.json", "[" * 100_000), "amvnet.json"),
         (write("amvnet.json", "9" * 20_000_000), "amvnet.json"),
         (remove("point_head.onnx"), "point_head.onnx"),
@@ -359,6 +359,10 @@ def test_a_broken_folder_is_one_line(
 ) -> None:
     break_folder(folder)
     fails(lambda: OnnxSegmenter(folder), word, "export again")
+
+
+def intensities(quantiles: list[float]) -> dict[str, Any]:
+    return {"quantiles": quantiles, "is_optional": False, "is_matched": True}
 
 
 @pytest.mark.parametrize(
@@ -379,10 +383,11 @@ def test_a_broken_folder_is_one_line(
         ("point_head position_scale", 10**400, ("position_scale",)),
         ("assertion threshold", math.nan, ("threshold",)),
         ("range_view width", 32, ("range_net", "export again")),
-        ("intensity", {"quantiles": [0.5, math.nan]}, ("quantiles", "export again")),
-        ("intensity", {"quantiles": [10**400] * 11}, ("quantiles", "export again")),
-        ("intensity", [0.5] * 11, ("quantiles", "export again")),
-        ("intensity", {"quantiles": [0.0] * 11}, ("quantiles", "export again")),
+        ("expects", None, ("networks expect", "export again")),
+        ("expects intensity", [0.5] * 11, ("networks expect", "export again")),
+        ("expects intensity", intensities([0.5, math.nan]), ("quantiles", "export again")),
+        ("expects intensity", intensities([10**400] * 11), ("quantiles", "export again")),
+        ("expects intensity", intensities([0.0] * 11), ("quantiles", "export again")),
         ("assertion", {"threshold": -5.0}, ("threshold", "-5")),
         ("point_head neighbours", 3, ("point_head", "export again")),
     ],

@@ -34,7 +34,7 @@ def test_the_usual_share_is_that_of_the_validation(share: float, tmp_path: Path)
     assert load(path).usual_uncertain == share
 
 
-@pytest.mark.parametrize("metrics", [{}, {"point_head": {}}, {"point_head": None}])
+@pytest.mark.parametrize("metrics", [{}, {"point_head": {}}])
 def test_weights_that_do_not_say_have_a_default(metrics: dict[str, Any]) -> None:
     weights = replace(fresh_weights(), metrics=metrics)
     assert weights.usual_uncertain == USUAL_UNCERTAIN
