@@ -118,6 +118,20 @@ def at_origin(xyz: NDArray[np.floating]) -> NDArray[np.intp]:
     return indices
 
 
+def yaw_rotation(yaw: float) -> np.ndarray:
+    """Return the (2, 2) matrix that rotates x, y by `yaw` radians, counter-clockwise."""
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+def turned(scan: Scan, yaw: float) -> Scan:
+    """Return a scan whose points are rotated about z by `yaw` radians, counter-clockwise."""
+    points = scan.points.copy()
+    points[:, :2] = points[:, :2] @ yaw_rotation(yaw).T
+    return replace(scan, points=points)
+
+
 def check_scan(scan: Scan) -> Scan:
     """Return the scan; raise InputError if it has no valid point."""
     if not scan.valid.any():

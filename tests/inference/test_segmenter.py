@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -59,6 +60,21 @@ def equal_probabilities() -> np.ndarray:
 
 
 # ---- one scan
+
+
+def test_the_networks_get_the_scan_turned_by_the_yaw() -> None:
+    points, _ = street(0)
+    yaw = 2.0
+    turned = points.copy()
+    for row in turned:
+        x, y = map(float, row[:2])
+        row[:2] = (math.cos(yaw) * x - math.sin(yaw) * y, math.sin(yaw) * x + math.cos(yaw) * y)
+    segmenter = amvnet.load(fresh_weights())
+    result = segmenter(points, yaw=yaw)
+    assert (result.labels == segmenter(turned).labels).mean() > 0.999
+    assert (result.labels != segmenter(points).labels).any()
+    np.testing.assert_array_equal(result.require_origin().scan.points, points)
+    np.testing.assert_array_equal(segmenter.many([points], [yaw])[0].labels, result.labels)
 
 
 def test_every_point_gets_a_class_and_its_scores(result: Segmentation) -> None:

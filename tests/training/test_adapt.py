@@ -13,6 +13,7 @@ import pytest
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.drives.consensus import Consensus, DriveScan
+from amvnet.inference.drive import TURN
 from amvnet.training import adapt as adapting
 from amvnet.training.adapt import LEAST_PROBABILITY, LEAST_SIGHTS, Figures
 from amvnet.weights.file import load, save
@@ -59,7 +60,9 @@ def test_points_teach_that_are_sure_and_seen_by_several_scans(world: Path) -> No
     segmenter = amvnet.load(world / "w.safetensors")
     dataset = open_dataset(str(world / "data"))
     records = dataset.records(["00"])
-    results = [segmenter(dataset.read(record)) for record in records]
+    results = [
+        segmenter(dataset.read(record), yaw=index * TURN) for index, record in enumerate(records)
+    ]
     scans = []
     for index, (result, pose) in enumerate(zip(results, drive_poses(SCANS), strict=True)):
         xyz = result.require_origin().scan.points[:, :3]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from amvnet.config.schema import AugmentConfig
-from amvnet.scan import Scan
+from amvnet.scan import Scan, yaw_rotation
 from amvnet.training.augment import (
     ELEVATION_BINS,
     augment,
@@ -19,7 +19,6 @@ from amvnet.training.augment import (
     mix_lasers,
     paste,
     tilt_rotation,
-    yaw_rotation,
 )
 
 RandomScan = Callable[..., Scan]

@@ -36,8 +36,15 @@ class PastFusion:
         self._find_pose = find_pose
         self._waiting: deque[DriveScan[None]] = deque()
         self._fused: Iterator[Fused[None]] | None = None
+        self._count = 0  # of the scans that are fused
         self._stamp = 0  # of the last scan, nanoseconds
         self._last: tuple[int, Pose] | None = None  # stamp and pose of the last scan with a pose
+
+    def yaw(self, origin: Message) -> float:
+        """Return the angle by which the networks get the next scan turned, radians."""
+        from amvnet.inference.drive import TURN
+
+        return 0.0 if origin.stamp < self._stamp else self._count * TURN
 
     def __call__(
         self, origin: Message, xyz: NDArray[np.floating], result: Segmentation
@@ -57,9 +64,11 @@ class PastFusion:
         pose = self._find_pose(origin, is_back)
         if is_back or (pose is not None and self._jumps(pose)):
             self._fused = self._last = None
+            self._count = 0
         if pose is None:
             return result
 
+        self._count += 1
         self._last = (origin.stamp, pose)
         if self._fused is None:  # of past scans alone, each scan comes back at once
             self._fused = Consensus(past_only=True).stream(iter(self._waiting.popleft, None))

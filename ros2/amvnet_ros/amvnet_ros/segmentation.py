@@ -144,7 +144,7 @@ class CloudSegmenter:
             origin = Message.of(message)
 
         scan = self._normalise(cloud, self._topic)
-        result = self._segment(scan)
+        result = self._segment(scan, yaw=0.0 if self._fuse is None else self._fuse.yaw(origin))
         if self._fuse is not None:  # last, because odometry often comes after its scan
             result = self._fuse(origin, cloud.xyz, result)
         verdict = result.verdict  # None for a single network

@@ -46,12 +46,12 @@ class MethodLabels(NamedTuple):
     Attributes:
         ids: the train ids (N,) by method.
         uncertain: (N,) bool, the uncertain points, or None if there are not two networks.
-        scores: (N, K) the scores of the segmenter's method, or None if there is no segmenter.
+        turned: (N, K) the scores for the scan as `Drives.yaws` turns it, or None without drives.
     """
 
     ids: dict[str, np.ndarray]
     uncertain: np.ndarray | None = None
-    scores: np.ndarray | None = None
+    turned: np.ndarray | None = None
 
 
 Labelled = tuple[ScanRecord, Scan, MethodLabels]  # a scan with its labels by several methods
@@ -67,12 +67,14 @@ class Labeller:
         classes: a map from the classes of the labels, and from the classes of the data, to the
             classes that are scored; None if all three are the same.
         at_once: number of scans that `label` may take at the same time, each in a thread.
+        segmenter: what computes the labels, or None if they come from files.
     """
 
     label: Callable[[ScanRecord, Scan], MethodLabels]
     taxonomy: Taxonomy
     classes: ClassMap | None = None
     at_once: int = 1
+    segmenter: Segmenter | None = None
 
     def table(self, taxonomy: Taxonomy) -> np.ndarray:
         """Return the (K + 1,) uint8 train ids that are scored, by the K + 1 ids of a taxonomy."""
@@ -99,7 +101,8 @@ def evaluate(
         pictures: folder for pictures of a few scans from above. By default, none are drawn.
         progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans. Each returns the evaluation of all scans.
-        drives: the poses of the scans, if the method `DRIVE` is to be scored as well.
+        drives: the poses of the scans, if the method `DRIVE` is to be scored as well. The networks
+            then get each scan twice: as it is, and turned.
 
     Raises:
         InputError: if the labels do not have the dataset's classes, or a scan has no true labels.
@@ -113,7 +116,12 @@ def evaluate(
     pictured = {record.name for record in _pictured(records)}
 
     def label(record: ScanRecord, scan: Scan) -> tuple[ScanRecord, Scan, MethodLabels]:
-        return record, scan, labeller.label(record, scan)
+        labels = labeller.label(record, scan)
+        if drives is not None:
+            assert labeller.segmenter is not None
+            yaw = drives.yaws[record.sequence, record.name]
+            labels = labels._replace(turned=labeller.segmenter(scan, yaw=yaw).scores)
+        return record, scan, labels
 
     share = processes.share(records)
     labelled: Iterator[Labelled] = stream_labelled(
@@ -149,9 +157,9 @@ def _with_consensus(labelled: Iterator[Labelled], drives: Drives) -> Iterator[La
 
 def _drive_scan(item: Labelled, drives: Drives) -> DriveScan[Labelled]:
     record, scan, labels = item
-    assert labels.scores is not None
+    assert labels.turned is not None
     pose = drives.poses[record.sequence, record.name]
-    return DriveScan(item, scan.points[:, :3], labels.scores, pose)
+    return DriveScan(item, scan.points[:, :3], labels.turned, pose)
 
 
 def pictures_of(records: Sequence[ScanRecord], folder: Path) -> dict[Path, Signature]:
@@ -203,7 +211,7 @@ def label_by_weights(
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
         return labels_by_method(segmenter, check_scan(scan), methods)
 
-    return Labeller(label, segmenter.taxonomy, classes, segmenter.at_once)
+    return Labeller(label, segmenter.taxonomy, classes, segmenter.at_once, segmenter)
 
 
 def labels_by_method(
@@ -228,7 +236,7 @@ def labels_by_method(
     uncertain = None
     if METHODS[segmenter.method].has_two_networks:
         uncertain = expand_to_scan(scores.uncertain, scan.valid)
-    return MethodLabels(labels, uncertain, expand_to_scan(scores.merged, scan.valid))
+    return MethodLabels(labels, uncertain)
 
 
 @torch.inference_mode()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections import deque
+import math
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
@@ -27,6 +29,10 @@ from amvnet.scan import AnyArray, Scan
 from amvnet.weights.file import Weights
 
 STANDING = -1.2  # height above which points of a normalised scan stand on the ground, metres
+# Each scan of a drive goes to the networks turned by this angle more than the scan before, radians.
+# By the golden angle, no two scans in reach look the same to the networks, so that their errors at
+# the same place differ, and the consensus corrects more of them.
+TURN = math.pi * (3 - math.sqrt(5))
 FAR = 8.0  # distance up to which two scans are compared if they are not consecutive, metres
 LEAST_SCANS = 2  # smallest number of scans of a drive
 
@@ -67,6 +73,16 @@ class Drives:
         """A digest of all that labels depend on."""
         values = np.array(list(self.poses.values())).tobytes()
         return f"{hashlib.sha256(values).hexdigest()[:16]}, past only: {self.past_only}"
+
+    @cached_property
+    def yaws(self) -> dict[tuple[str, str], float]:
+        """The angle by which the networks get each scan turned, radians."""
+        places: Counter[str] = Counter()
+        yaws = {}
+        for source, name in self.poses:
+            yaws[source, name] = places[source] * TURN
+            places[source] += 1
+        return yaws
 
     def consensus(self) -> Consensus:
         """Return a new consensus for the scans of one drive."""
@@ -157,7 +173,7 @@ def drive(
         given = None if poses is None else iter(poses)
         odometry = Odometry() if given is None else None
         for index, points in enumerate(scans):
-            result = segmenter(points)
+            result = segmenter(points, yaw=index * TURN)
             scan = result.require_origin().scan
             if odometry is not None:
                 pose = odometry(scan.points[scan.valid, :3])

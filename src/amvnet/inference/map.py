@@ -60,7 +60,8 @@ def map_drive(
 
     def segment(scan: InputScan, loaded: LoadedScan) -> tuple[np.ndarray, Segmentation, Poses]:
         points = points_of(loaded, drives.of_files)
-        return points, segmenter(loaded.scan), drives.poses[key_of(scan)]
+        result = segmenter(loaded.scan, yaw=drives.yaws[key_of(scan)])
+        return points, result, drives.poses[key_of(scan)]
 
     done = 0
     if saved is not None and saved.resume:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.inference.drive import DriveChoice, find_poses
+from amvnet.inference.drive import DriveChoice, Drives, find_poses, key_of
 from amvnet.inference.journal import Entry, describe_other_run
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import Pipeline, Segment, check_faults, check_output
@@ -97,7 +97,7 @@ def predict(
     request = replace(request, precision=segmenter.engine.precision)  # not "auto"
     pipeline = Pipeline(
         scans,
-        segment_by(segmenter, classes),
+        segment_by(segmenter, classes, drives),
         output,
         taxonomy,
         batch=batch,
@@ -118,16 +118,20 @@ def predict(
     return len(scans)
 
 
-def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment:
+def segment_by(
+    segmenter: Segmenter, classes: ClassMap | None = None, drives: Drives | None = None
+) -> Segment:
     """Return a function that segments scans.
 
     Args:
         classes: maps the labels to other classes; without it, they stay unchanged.
+        drives: the drives of the scans, if their scores are to be fused over time.
     """
     table = None if classes is None else classes.table(segmenter.taxonomy)
 
     def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
-        results = segmenter.many(scans)
+        yaws = None if drives is None else [drives.yaws[key_of(scan)] for scan in inputs]
+        results = segmenter.many(scans, yaws)
         if table is None:
             return results
         return [replace(result, labels=table[result.labels]) for result in results]

@@ -18,7 +18,7 @@ from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.memory import return_freed_memory
-from amvnet.scan import AnyArray, Scan
+from amvnet.scan import AnyArray, Scan, turned
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
 
@@ -81,6 +81,7 @@ class Segmenter:
         self,
         points: AnyArray | Scan | Path | str,
         columns: str | Sequence[str] | None = None,
+        yaw: float = 0.0,
     ) -> Segmentation:
         """Segment one scan.
 
@@ -94,6 +95,8 @@ class Segmenter:
             columns: the names of the columns of an array or of a file of rows, such as
                 "x,y,z,intensity,ring" or a list of them. By default, named fields keep their names,
                 and other columns are recognised by their number and their values.
+            yaw: the networks get the scan turned by this angle about z, radians. A scan looks a
+                little different to them from each angle, so that several angles see more than one.
 
         Raises:
             InputError: if there is no valid point, more than a few intensities are out of range,
@@ -106,20 +109,24 @@ class Segmenter:
                 "leave them out"
             )
         if not isinstance(points, Path | str):
-            return self._segment([checked_scan(points, columns, self.weights.expects.intensity)])[0]
+            scan = checked_scan(points, columns, self.weights.expects.intensity)
+            return self._segment([scan], [yaw])[0]
 
         scans, assumed = self._open(points, layout=parse_layout(columns))
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
             )
-        return self._segment_input(scans[0], assumed)
+        return self._segment_input(scans[0], assumed, yaw)
 
-    def many(self, scans: Sequence[AnyArray | Scan]) -> list[Segmentation]:
+    def many(
+        self, scans: Sequence[AnyArray | Scan], yaws: Sequence[float] | None = None
+    ) -> list[Segmentation]:
         """Segment several scans in one pass of the networks, which suits a GPU.
 
         Args:
             scans: arrays or `Scan`s, as `__call__` takes them as `points`; paths are not taken.
+            yaws: the yaw of each scan, as `__call__` takes it; by default 0.
 
         Raises:
             InputError: if a scan cannot be segmented; segment them one by one to see which.
@@ -127,13 +134,15 @@ class Segmenter:
         checked = []
         for scan in scans:
             checked.append(checked_scan(scan, trained=self.weights.expects.intensity))
-        return self._segment(checked)
+        return self._segment(checked, yaws)
 
-    def _segment(self, scans: Sequence[Scan]) -> list[Segmentation]:
+    def _segment(
+        self, scans: Sequence[Scan], yaws: Sequence[float] | None = None
+    ) -> list[Segmentation]:
         """Segment scans in one pass; each has a valid point."""
         is_large = sum(map(len, scans)) >= LARGE_BATCH
         with return_freed_memory() if is_large else nullcontext():
-            batch = self.batch(scans)
+            batch = self.batch(scans, yaws)
             labels, scores = fetch(self.engine.score(batch))
 
         results = []
@@ -176,10 +185,10 @@ class Segmenter:
         scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
         return scans, assumed
 
-    def _segment_input(self, scan: InputScan, assumed: list[str]) -> Segmentation:
+    def _segment_input(self, scan: InputScan, assumed: list[str], yaw: float = 0.0) -> Segmentation:
         """Read and segment one of the scans that `_open` returned."""
         loaded = scan.load(labels=True)
-        result = self(loaded.scan)
+        result = self(loaded.scan, yaw=yaw)
 
         assert result.origin is not None
         origin = replace(
@@ -187,11 +196,18 @@ class Segmenter:
         )
         return replace(result, origin=origin)
 
-    def batch(self, scans: Sequence[Scan]) -> PointBatch:
+    def batch(self, scans: Sequence[Scan], yaws: Sequence[float] | None = None) -> PointBatch:
         """Return the P valid points of some scans, prepared for the networks, as one batch.
+
+        Args:
+            yaws: the yaw of each scan, as `__call__` takes it; by default 0.
 
         Raises:
             InputError: if more than a few intensities are out of range.
         """
         expects = self.weights.expects
-        return PointBatch.of([expects.prepare(scan) for scan in scans], self.device)
+        prepared = [expects.prepare(scan) for scan in scans]
+        for index, yaw in enumerate(yaws or ()):
+            if yaw:
+                prepared[index] = turned(prepared[index], yaw)
+        return PointBatch.of(prepared, self.device)

@@ -17,8 +17,8 @@ from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, inside, temporary_folder
-from amvnet.inference.drive import Drives, digest_of
-from amvnet.inference.listing import InputScan
+from amvnet.inference.drive import Drives, digest_of, key_of
+from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
@@ -168,10 +168,15 @@ def _fused(
     progress: Progress,
 ) -> Iterator[tuple[InputScan, Segmentation, np.ndarray, np.ndarray]]:
     """Yield each scan, its result, and the probabilities (N, K) and sights (N,) of its points."""
+
+    def segment(scan: InputScan, loaded: LoadedScan) -> tuple[InputScan, LoadedScan, Segmentation]:
+        yaw = 0.0 if drives is None else drives.yaws[key_of(scan)]
+        return scan, loaded, segmenter(loaded.scan, yaw=yaw)
+
     outcomes = stream_scans(
         scans,
         lambda scan: scan.load(),
-        lambda scan, loaded: (scan, loaded, segmenter(loaded.scan)),
+        segment,
         segmenter.at_once,
         progress,
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from amvnet.config.schema import AugmentConfig
-from amvnet.scan import Scan
+from amvnet.scan import Scan, yaw_rotation
 
 ELEVATION_BINS = 64  # number of bins that replace the lasers of a scan without ring indices
 OUTLIERS = 0.5  # share of the points below the lowest bin, and above the highest bin, percent
@@ -158,13 +158,6 @@ def disturb(scores: Tensor, points: Tensor, rng: np.random.Generator) -> Tensor:
 
     confused_scores = softened @ torch.from_numpy(leak).to(softened)
     return softened + strength[:, None].to(softened) * (confused_scores - softened)
-
-
-def yaw_rotation(yaw: float) -> np.ndarray:
-    """Return the (2, 2) matrix that rotates x, y by `yaw` radians, counter-clockwise."""
-    cos = np.cos(yaw)
-    sin = np.sin(yaw)
-    return np.array([[cos, -sin], [sin, cos]])
 
 
 def tilt_rotation(roll: float, pitch: float) -> np.ndarray:
