@@ -556,7 +556,7 @@ def test_a_head_may_learn_from_points_of_another_tau(
     monkeypatch.setattr(PointGatherer, "gather", watched)
     options = ("--stage", "head", "--init", run, "--training.head.epochs", 1)
     train(world, tmp_path / "own", *options)
-    weights = train(world, tmp_path / "few", *options, "--training.head.tau", 0.95)
+    weights = train(world, tmp_path / "few", *options, "--training.head.tau", 0.9)
 
     # It validates at the model's tau, which stays.
     assert 0 < shares["train"][1] < shares["train"][0]
