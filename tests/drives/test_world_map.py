@@ -197,6 +197,18 @@ def test_a_map_that_was_stopped_is_resumed_to_the_same_map(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.ply", "whole.ply"]
 
 
+@pytest.mark.parametrize("content", [b"", b"PK", {"done": 2}, {"request": "other"}])
+def test_an_unfinished_map_that_cannot_be_read_is_begun_anew(
+    tmp_path: Path, content: bytes | dict[str, object]
+) -> None:
+    path = tmp_path / ".map.ply.unfinished.npz"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.savez(path, **content)  # type: ignore[arg-type]
+    assert MapBuilder(SIZE, SEMANTICKITTI).restore(path, "a request") == 0
+
+
 def test_a_map_is_of_one_drive(world: Path, tmp_path: Path) -> None:
     for sequence in ("01", "02"):
         write_drive(tmp_path / "data", sequence, 3)

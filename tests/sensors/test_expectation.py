@@ -20,7 +20,6 @@ from amvnet.sensors.lasers import SensorGeometry, measure_sensor
 from amvnet.sensors.lidars import KNOWN_HEIGHTS, KNOWN_SENSORS, Sensor
 from amvnet.sensors.normalise import Normaliser
 from amvnet.training.expectation import expected_after
-from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.commands import fails, run_cli
@@ -46,7 +45,7 @@ def trained_at(height: float, root: Path) -> Weights:
     scans = TrainingScans(data, data.records(["08"]), ())
     weights = fresh_weights()
     recipe = Recipe(model=weights.model, sensor="hdl64e")
-    expects = expected_after(Plan(recipe, scans, root, stages=("rv", "bev")), weights)
+    expects = expected_after(scans, weights, recipe, ("rv", "bev"))
     return replace(weights, sensor="hdl64e", expects=expects)
 
 

@@ -29,7 +29,6 @@ from amvnet.sensors.lidars import Sensor, rotation_from_degrees
 from amvnet.sensors.measure import MEASURED_SCANS, Recording
 from amvnet.sensors.normalise import Normaliser
 from amvnet.training.expectation import expected_after
-from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights
 
 from fixtures.commands import fails
@@ -188,7 +187,7 @@ def measured_intensity(data: SemanticKitti, sequences: Sequence[str]) -> Trained
     """Return the intensities that networks expect which are trained on a dataset from scratch."""
     scans = TrainingScans(data, data.records(sequences), ())
     weights = without(fresh_weights(), *PARTS)
-    return expected_after(Plan(Recipe(), scans, data.root, stages=("rv", "bev")), weights).intensity
+    return expected_after(scans, weights, Recipe(), ("rv", "bev")).intensity
 
 
 def test_scans_without_intensities_have_quantiles_of_zero_and_equal_ones_are_left_out(

@@ -92,7 +92,7 @@ def test_predict_gives_finished_weights_the_intensities_of_their_training(
         stage="all" if stages == BOTH else stages[0],
     )
     weights = first_weights(plan, init, stages)
-    expects = expected_after(replace(plan, stages=stages), weights)
+    expects = expected_after(plan.scans, weights, plan.recipe, stages)
     _, val = make_loaders(replace(plan, expects=expects), recipe.training.rv)
     assert val is not None
     in_training = val.dataset[(0, 0)]
@@ -137,7 +137,7 @@ def test_streets_that_are_joined_with_others_are_matched_as_streets_alone(
             recipe, data, tmp_path / "run", lambda each: split_records(each, ["0"], ["900000"])
         )
         weights = Weights(recipe.model, plan.scans.dataset.taxonomy)
-        found.append(expected_after(plan, weights).intensity)
+        found.append(expected_after(plan.scans, weights, plan.recipe, plan.stages).intensity)
     assert found[0].is_matched
     assert found[0].is_optional  # a quarter of the streets hide their intensities
     assert found[0] == found[1]

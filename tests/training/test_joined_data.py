@@ -293,7 +293,7 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
     a, b = [TrainingScans(each, each.records(each.sequences("train")), ()) for each in own]
 
     def expected(scans: TrainingScans) -> Expectation:
-        return expected_after(Plan(Recipe(), scans, tmp_path, stages=("rv", "bev")), weights)
+        return expected_after(scans, weights, Recipe(), ("rv", "bev"))
 
     both = expected(join(a, [b]))
     assert not both.as_is

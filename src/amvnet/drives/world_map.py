@@ -170,15 +170,16 @@ class MapBuilder:
         try:
             with np.load(path, allow_pickle=False) as file:
                 state = dict(file)
-        except (OSError, ValueError, EOFError, BadZipFile):
+            earlier, done = str(state.pop("request")), int(state.pop("done"))
+            origin = state.pop("origin")
+        except (OSError, ValueError, EOFError, KeyError, BadZipFile):
             return 0
-        if str(state.pop("request")) != request:
+        if earlier != request:
             raise InputError(
                 f"{path}: expected an unfinished map of the same scans, poses, weights and "
                 "voxels, found another one; leave --resume out"
             )
-        done = int(state.pop("done"))
-        self._origin = state.pop("origin")
+        self._origin = origin
         self._table.restore(**state)
         return done
 

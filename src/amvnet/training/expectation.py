@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,9 +26,6 @@ from amvnet.sensors.intensity import (
 from amvnet.sensors.lasers import measure_sensor
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
-
-if TYPE_CHECKING:
-    from amvnet.training.plan import Plan
 
 NETWORK_OF = {"rv": "range_net", "bev": "polar_net"}  # the network that a stage trains
 # Largest number of scans that are measured; it is enough for the mean height of simulated sensors.
@@ -61,18 +57,22 @@ def expected_before(
     return dataclasses.replace(known, view=recipe.model.range_view, intensity=intensity)
 
 
-def expected_after(plan: Plan, weights: Weights) -> Expectation:
-    """Return what the networks of a plan expect after their training, measured on its scans.
+def expected_after(
+    scans: TrainingScans, weights: Weights, recipe: Recipe, stages: Sequence[str]
+) -> Expectation:
+    """Return what networks expect after their training, measured on its scans.
 
     Args:
-        plan: the plan, with its stages.
+        scans: the scans to train on.
         weights: the weights that the training begins with.
+        recipe: the recipe of the training.
+        stages: the stages to train.
     """
-    if set(NETWORK_OF.values()) & set(weights.parts) and not _networks(plan.stages):
+    if set(NETWORK_OF.values()) & set(weights.parts) and not _networks(stages):
         return weights.expects  # a head takes what its networks take
 
-    first = plan.scans.dataset.members[0]
-    sampled = _sample(plan.scans)
+    first = scans.dataset.members[0]
+    sampled = _sample(scans)
     known = weights.expects
     as_is = True
     geometry = measure_sensor(sampled)
@@ -92,9 +92,9 @@ def expected_after(plan: Plan, weights: Weights) -> Expectation:
         if quantiles == NO_INTENSITY or are_quantiles(quantiles):
             intensity = TrainedIntensity(quantiles, is_optional)
 
-    sensor = trained_sensor(plan.recipe.sensor, geometry)
+    sensor = trained_sensor(recipe.sensor, geometry)
     known = dataclasses.replace(known, sensor=sensor, intensity=intensity, as_is=as_is)
-    return expected_before(known, weights.parts, plan.recipe, plan.stages)
+    return expected_before(known, weights.parts, recipe, stages)
 
 
 def _networks(stages: Sequence[str]) -> set[str]:

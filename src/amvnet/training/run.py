@@ -75,7 +75,7 @@ def _train_stages(plan: Plan, stage: str, init: Weights | None) -> Path:
         _check_initial(plan, name)
     counts, taught = check_data(plan)
     plan.processes.wait()  # until all streets of the first epoch are simulated
-    expects = plan.expects or expected_after(plan, weights)
+    expects = plan.expects or expected_after(plan.scans, weights, plan.recipe, names)
     plan = dataclasses.replace(plan, class_counts=counts, taught=taught, expects=expects)
     if plan.processes.first:
         write_record(plan, stage, init)
