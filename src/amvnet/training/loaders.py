@@ -76,7 +76,7 @@ class ScanSet(data.Dataset[Scan]):
     def __getitem__(self, key: Key) -> Scan:
         epoch, index = key
         if self.augment is None:
-            return self._read(key)
+            return self._read((0, index))  # what validates does not change
 
         # Keep the order of the random draws, because it decides which scan a seed gives.
         config = self.augment

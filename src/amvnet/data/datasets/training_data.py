@@ -56,11 +56,14 @@ class Source:
         Raises:
             InputError: if a sequence does not exist or is in both, or no scan has labels.
         """
-        chosen = [dataset.records(train), dataset.records(val)]
-        labelled = [dataset.labelled(chosen[0]), dataset.labelled(chosen[1]) if val else []]
-        used = {record.name for records in labelled for record in records}
-        unlabelled = [record for records in chosen for record in records if record.name not in used]
-        return cls(dataset, *labelled, unlabelled)
+        chosen, chosen_val = dataset.records(train), dataset.records(val)
+        labelled, labelled_val = (
+            dataset.labelled(chosen),
+            dataset.labelled(chosen_val) if val else [],
+        )
+        used = {record.name for record in (*labelled, *labelled_val)}
+        unlabelled = [record for record in (*chosen, *chosen_val) if record.name not in used]
+        return cls(dataset, labelled, labelled_val, unlabelled)
 
 
 @dataclass(frozen=True)
