@@ -53,25 +53,25 @@ def named_sequences(
     dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
 ) -> tuple[Sequence[str], Sequence[str]]:
     """Return the sequences to train on and to validate with, as `to_train` does."""
-    if not (train or val or with_val or dataset.is_split):
-        _require_two(dataset)
-
     # A sequence that the user named for one purpose is not used for the other by default.
     usual = dataset.division()
-    if (val or with_val) and not dataset.is_split:
-        usual["train"] = dataset.trainable()
+    trainable = usual["train"] if dataset.is_split else dataset.trainable()
     names_val = val or _without(usual["val"], train or ())
-    names_train = train or _without(usual["train"], names_val)
+    names_train = train or _without(trainable if val or with_val else usual["train"], names_val)
 
     if with_val:
         names_train = (*names_train, *_without(names_val, names_train))
         names_val = ()
     elif not names_train or not names_val:
-        for split in ("val", "train"):
-            dataset.sequences(split)  # an empty split has its own message
+        for split, named in (("val", val), ("train", train)):
+            if dataset.is_split and not named:
+                dataset.sequences(split)  # a split without a sequence has its own message
+        alone = " alone" if len(trainable) == 1 else ""
         raise InputError(
-            f"{dataset.spec}: expected two sequences, one to train on and one to validate with, "
-            f"found {', '.join(dataset.sequences('all'))}; name them"
+            f"{dataset.spec}: expected two sequences with labels, one to train on and one to "
+            f"validate with, found {', '.join(trainable) or 'none'}{alone}; name them, add another "
+            "one, or divide it under split in a YAML file that describes the scans "
+            "(docs/own_data.md)"
         )
     of_test = sorted(set(names_train) & set(dataset.splits().get("test", ())))
     if of_test:
@@ -80,17 +80,6 @@ def named_sequences(
             f"{', '.join(of_test)}; name others, or correct the split"
         )
     return names_train, names_val
-
-
-def _require_two(dataset: Dataset) -> None:
-    """Raise InputError if the sequences do not suffice for a training and its validation."""
-    names = dataset.trainable()
-    if len(names) < 2:
-        raise InputError(
-            f"{dataset.spec}: expected two sequences with labels, one to train on and one to "
-            f"validate with, found {' '.join(names) or 'none'} alone; add another one, or divide "
-            "it under split in a YAML file that describes the scans (docs/own_data.md)"
-        )
 
 
 def _without(names: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
