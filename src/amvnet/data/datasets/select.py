@@ -63,15 +63,18 @@ def named_sequences(
         names_train = (*names_train, *_without(names_val, names_train))
         names_val = ()
     elif not names_train or not names_val:
+        if not (train or val or dataset.is_split) and len(trainable) < 2:
+            raise InputError(
+                f"{dataset.spec}: expected two sequences with labels, one to train on and one to "
+                f"validate with, found {' '.join(trainable) or 'none'} alone; add another one, or "
+                "divide it under split in a YAML file that describes the scans (docs/own_data.md)"
+            )
         for split, named in (("val", val), ("train", train)):
-            if dataset.is_split and not named:
+            if not named:
                 dataset.sequences(split)  # a split without a sequence has its own message
-        alone = " alone" if len(trainable) == 1 else ""
         raise InputError(
-            f"{dataset.spec}: expected two sequences with labels, one to train on and one to "
-            f"validate with, found {', '.join(trainable) or 'none'}{alone}; name them, add another "
-            "one, or divide it under split in a YAML file that describes the scans "
-            "(docs/own_data.md)"
+            f"{dataset.spec}: expected two sequences, one to train on and one to validate with, "
+            f"found {', '.join(dataset.splits()['all'])}; name them"
         )
     of_test = sorted(set(names_train) & set(dataset.splits().get("test", ())))
     if of_test:
