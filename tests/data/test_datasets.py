@@ -15,7 +15,7 @@ from amvnet.cli.options import LabelledChoice
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, VAL, NuScenes
 from amvnet.data.datasets.open import is_dataset, open_dataset
-from amvnet.data.datasets.select import split_records
+from amvnet.data.datasets.select import to_train
 from amvnet.data.taxonomy import SEMANTICKITTI
 
 from fixtures.commands import fails
@@ -298,13 +298,13 @@ def test_nuscenes_own_names_of_splits_are_taken(tmp_path: Path) -> None:
 
 def test_an_empty_split_names_sequences_that_were_not_trained_on(layout: Layout) -> None:
     dataset = open_dataset(layout.spec)
-    (val,) = dataset.official("val")
-    fails(lambda: dataset.official("test"), f"not trained, such as --sequences {val}")
+    (val,) = dataset.splits()["val"]
+    fails(lambda: dataset.sequences("test"), f"not trained, such as --sequences {val}")
 
 
 def test_of_sequences_to_train_on_none_is_advised(tmp_path: Path) -> None:
     dataset = open_dataset(str(make_streets(tmp_path, ("03", "04"), 1)))
-    fails(lambda: dataset.official("val"), "not trained, with --sequences")
+    fails(lambda: dataset.sequences("test"), "not trained, with --sequences")
 
 
 def test_a_scan_below_a_folder_with_an_at_sign_is_a_scan(tmp_path: Path) -> None:
@@ -393,15 +393,15 @@ def test_without_the_official_split_the_last_sequence_validates_and_tests_are_le
 ) -> None:
     dataset = open_dataset(str(make_streets(tmp_path, sequences, 1)))
     assert (dataset.sequences("train"), dataset.sequences("val")) == (train, val)
-    scans = split_records(dataset, None, None)
+    scans = to_train(dataset)
     assert tuple(record.sequence for record in scans.train) == train
     assert tuple(record.sequence for record in scans.val) == val
 
 
 def test_a_lone_sequence_is_not_split(tmp_path: Path) -> None:
     dataset = open_dataset(str(make_streets(tmp_path, ("00", "11"), 1)))
-    fails(lambda: split_records(dataset, None, None), "two sequences", "00 alone", "YAML")
-    scans = split_records(dataset, None, None, with_val=True)
+    fails(lambda: to_train(dataset), "two sequences", "00 alone", "YAML")
+    scans = to_train(dataset, with_val=True)
     assert [record.sequence for record in scans.train] == ["00"]
 
 

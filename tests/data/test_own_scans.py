@@ -13,7 +13,7 @@ import yaml
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
-from amvnet.data.datasets.select import all_to_train, split_records
+from amvnet.data.datasets.select import to_mix_in, to_train
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
@@ -116,20 +116,20 @@ def test_scans_without_a_label_file_are_left_out_of_the_training(tmp_path: Path)
     data = open_own(describe(tmp_path))
     unlabelled = data.read(data.records(["a"])[1])
     assert unlabelled.labels is None
-    scans = split_records(data, None, None)
+    scans = to_train(data)
     assert [record.name for record in scans.train] == ["a/0"]
     assert [record.name for record in scans.val] == ["b/1"]
 
     # Without labels, b does not validate: a is left alone.
     (tmp_path / "b/1.label").unlink()
     fails(
-        lambda: split_records(data_of(tmp_path), None, None),
+        lambda: to_train(data_of(tmp_path)),
         "two sequences",
         "a alone",
         "under split",
     )
     first = tmp_path / "b/0.label"  # that was looked for
-    fails(lambda: split_records(data_of(tmp_path), None, ["b"]), "labelled scans", first, "other 2")
+    fails(lambda: to_train(data_of(tmp_path), None, ["b"]), "labelled scans", first, "other 2")
 
 
 def data_of(folder: Path) -> OwnScans:
@@ -165,7 +165,7 @@ def sites(folder: Path, split: dict[str, Any] | None = None, labelled: str = "ab
 
 def sequences_of(data: OwnScans) -> tuple[set[str], set[str]]:
     """Return the sequences that are trained on, and those that are validated with."""
-    scans = split_records(data, None, None)
+    scans = to_train(data)
     return {record.sequence for record in scans.train}, {record.sequence for record in scans.val}
 
 
@@ -206,20 +206,20 @@ def test_an_entry_of_the_split_without_scans_is_refused(
 
 def test_a_split_without_val_is_not_replaced_by_the_default(tmp_path: Path) -> None:
     data = sites(tmp_path, {"train": ["a", "b"]})
-    fails(lambda: split_records(data, None, None), "split val", "only train")
-    scans = split_records(data, None, ["c"])
+    fails(lambda: to_train(data), "split val", "only train")
+    scans = to_train(data, None, ["c"])
     assert {record.sequence for record in scans.train} == {"a", "b"}
-    everything = split_records(data, None, None, with_val=True)
+    everything = to_train(data, with_val=True)
     assert {record.sequence for record in everything.train} == {"a", "b"}
 
 
 def test_test_scans_are_never_trained_on(tmp_path: Path) -> None:
     data = sites(tmp_path, {"val": "c", "test": "b"})
-    fails(lambda: split_records(data, ["a", "b"], None), "test split", "found b")
+    fails(lambda: to_train(data, ["a", "b"], None), "test split", "found b")
     for with_val in (False, True):
-        scans = split_records(data, None, None, with_val)
+        scans = to_train(data, with_val=with_val)
         assert "b" not in {record.sequence for record in scans.train}
-    assert "b" not in {record.sequence for record in all_to_train(data).train}
+    assert "b" not in {record.sequence for record in to_mix_in(data).train}
 
 
 def test_the_default_split_validates_with_the_last_sequence_that_has_labels(
@@ -230,9 +230,9 @@ def test_the_default_split_validates_with_the_last_sequence_that_has_labels(
 
 def test_named_sequences_are_not_used_for_the_other_purpose(tmp_path: Path) -> None:
     data = sites(tmp_path)
-    scans = split_records(data, None, ["a"])
+    scans = to_train(data, None, ["a"])
     assert {record.sequence for record in scans.train} == {"b", "c", "d"}
-    fails(lambda: split_records(data, ["d"], None), "two sequences", "name them")
+    fails(lambda: to_train(data, ["d"], None), "two sequences", "name them")
 
 
 def test_evaluate_scores_the_scans_that_train_validates_with(

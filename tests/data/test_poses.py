@@ -65,7 +65,7 @@ def test_a_dataset_without_poses_has_none(tmp_path: Path) -> None:
 def test_poses_of_nuscenes_are_those_of_the_car_and_of_its_sensor() -> None:
     """The reference turns a point by each quaternion, which the tables round."""
     dataset = open_dataset(str(GOLDEN / "nuscenes"))
-    records = dataset.records(dataset.official("all"))
+    records = dataset.records(dataset.sequences("all"))
     poses = dataset.poses(records)
     assert poses is not None
     tables = {}

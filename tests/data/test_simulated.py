@@ -17,8 +17,9 @@ from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import is_dataset, open_dataset
-from amvnet.data.datasets.select import split_records
+from amvnet.data.datasets.select import to_train
 from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.laser_order import lasers_by_order
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.sensors.expectation import Expectation
@@ -97,6 +98,10 @@ def test_other_classes_are_refused(tmp_path: Path) -> None:
     fails(lambda: open_dataset(f"simulated-hdl64e:{tmp_path}", NUSCENES), "classes", "nuscenes")
 
 
+def data_of(dataset: Dataset, *streets: str) -> TrainingData:
+    return TrainingData([Source(dataset, dataset.records(streets))])
+
+
 def test_the_splits_are_different_streets(sensor: str, tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path, sensor)
     train = dataset.sequences("train")
@@ -106,7 +111,7 @@ def test_the_splits_are_different_streets(sensor: str, tmp_path: Path) -> None:
     assert dataset.sequences("all") == (*train, *dataset.sequences("val"))
     fails(lambda: dataset.sequences("test"), "train, val, all", "test")
 
-    scans = split_records(dataset, None, None)
+    scans = to_train(dataset)
     assert len(scans.train) == 6 * len(train)
     assert len(scans.val) == 36
 
@@ -268,7 +273,7 @@ def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
 ) -> None:
     dataset = SimulatedStreets(tmp_path)
     config = AugmentConfig(mix=0.5, laser_mix=0.5, paste=0.5)
-    scans = ScanSet(dataset, dataset.records(["0", "1"]), Expectation(), config)
+    scans = ScanSet(data_of(dataset, "0", "1"), Expectation(), config)
     loader = make_loader(scans, batch=3, workers=workers, shuffle=True)
     for epoch in (0, 1):
         loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
@@ -287,7 +292,7 @@ def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
 
 def test_validation_has_the_same_streets_in_every_epoch(tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path)
-    scans = ScanSet(dataset, dataset.records(["7"]), Expectation())
+    scans = ScanSet(data_of(dataset, "7"), Expectation())
     assert scans[4, 2].name == scans[0, 2].name == "000007/000002"
 
 
@@ -296,7 +301,7 @@ def test_objects_to_paste_are_rare_classes_of_both_benchmarks(
     taxonomy: Taxonomy, tmp_path: Path
 ) -> None:
     dataset = SimulatedStreets(tmp_path, "hdl64e" if taxonomy is SEMANTICKITTI else "hdl32e")
-    scans = ScanSet(dataset, [], Expectation())
+    scans = ScanSet(data_of(dataset), Expectation())
     names = {taxonomy.classes[train_id - 1] for train_id in scans.pasted}
     assert {"bicycle", "motorcycle", "truck"} <= names
     assert not names & {"car", "road", "sidewalk", "driveable_surface", "vegetation"}

@@ -20,6 +20,7 @@ import amvnet
 from amvnet import onnx_runner
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.evaluation.scoring import label_by_weights
 from amvnet.export.int8 import calibration_scans
@@ -382,8 +383,8 @@ def by_fuse(world: World, points: np.ndarray) -> None:
 
 def by_training(world: World, points: np.ndarray) -> None:
     dataset = open_dataset(str(world.write_kitti(points)))
-    scans = ScanSet(dataset, dataset.records(["08"]), BY_LASER.expects)
-    batch, _, _ = collate([scans[0, 0]])
+    data = TrainingData([Source(dataset, dataset.records(["08"]))])
+    batch, _, _ = collate([ScanSet(data, BY_LASER.expects)[0, 0]])
     RangeView(LASERS_VIEW).project(batch)
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import nn
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.runtime.distributed import Processes
 from amvnet.sensors.expectation import Expectation
@@ -234,8 +235,8 @@ def test_the_processes_parts_of_the_batches_make_up_those_of_one_process(
 @pytest.mark.parametrize(("size", "count"), [(10, 2), (11, 2), (7, 3), (2, 4)])
 def test_processes_validate_every_scan_once(size: int, count: int) -> None:
     dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
-    records: Any = [None] * size
-    scans = ScanSet(dataset, records, Expectation())
+    records: Any = [SimpleNamespace(name=index) for index in range(size)]
+    scans = ScanSet(TrainingData([Source(dataset, records)]), Expectation())
     keys: list[tuple[int, int]] = []
     for rank in range(count):
         loader = make_loader(scans, 1, 0, shuffle=False, processes=Processes(rank, count))

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from amvnet.config.schema import RangeViewConfig, Recipe
-from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation, trained_sensor
 from amvnet.sensors.intensity import SIMULATED_QUANTILES, TrainedIntensity
@@ -42,7 +42,7 @@ def trained_at(height: float, root: Path) -> Weights:
     for scan in range(SCANS):
         write_scan(root, "08", f"{scan:06d}", *raised_street(scan, height))
     data = SemanticKitti(root)
-    scans = TrainingScans(data, data.records(["08"]), ())
+    scans = TrainingData([Source(data, data.records(["08"]))])
     weights = fresh_weights()
     recipe = Recipe(model=weights.model, sensor="hdl64e")
     expects = expected_after(scans, weights, recipe, ("rv", "bev"))

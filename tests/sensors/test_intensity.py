@@ -13,8 +13,8 @@ import pytest
 
 import amvnet
 from amvnet.config.schema import RangeViewConfig, Recipe
-from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.formats.cloud import Cloud
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
@@ -185,7 +185,7 @@ def test_quantiles_that_no_intensities_have_are_refused(values: Any) -> None:
 
 def measured_intensity(data: SemanticKitti, sequences: Sequence[str]) -> TrainedIntensity | None:
     """Return the intensities that networks expect which are trained on a dataset from scratch."""
-    scans = TrainingScans(data, data.records(sequences), ())
+    scans = TrainingData([Source(data, data.records(sequences))])
     weights = without(fresh_weights(), *PARTS)
     return expected_after(scans, weights, Recipe(), ("rv", "bev")).intensity
 

@@ -11,9 +11,8 @@ import pytest
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import HeadTraining
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.runtime.distributed import ALONE, Processes
-from amvnet.sensors.expectation import Expectation
 from amvnet.training.head_points import PointGatherer, PointSampler
 from amvnet.training.plan import Plan
 
@@ -74,17 +73,12 @@ def test_processes_share_each_batch_of_the_drawn_points() -> None:
 
 def test_the_points_that_are_drawn_stand_for_all_uncertain_ones(tmp_path: Path) -> None:
     dataset = open_dataset(str(make_streets(tmp_path / "data", ("00",))))
-    records = dataset.records(["00"])
+    data = TrainingData([Source(dataset, dataset.records(["00"]))])
     points = []
     for most in (60, 10**6):
         path = write_recipe(tmp_path / "r.yaml", training={"head": {"points": most}})
-        plan = Plan(
-            load_recipe(str(path)),
-            TrainingScans(dataset, records, []),
-            tmp_path / "run",
-            expects=Expectation(),
-        )
-        points.append(PointGatherer(plan, fresh_weights()).gather(records, tmp_path / str(most)))
+        plan = Plan(load_recipe(str(path)), data, tmp_path / "run")
+        points.append(PointGatherer(plan, fresh_weights()).gather(data, tmp_path / str(most)))
 
     few, everything = points
     assert len(few) == 60 < len(everything)

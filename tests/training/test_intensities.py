@@ -13,17 +13,17 @@ from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.datasets.select import split_records
+from amvnet.data.datasets.select import to_train
 from amvnet.inference.reading import normalised
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import (
     SIMULATED_QUANTILES,
 )
 from amvnet.sensors.normalise import Normaliser
+from amvnet.training.checking import first_weights
 from amvnet.training.expectation import expected_after, expected_before
 from amvnet.training.networks import make_loaders
 from amvnet.training.plan import Plan
-from amvnet.training.run import first_weights
 from amvnet.weights.file import PARTS, Weights
 
 from fixtures.tiny import fake_drive, fresh_weights, street, with_intensities, write_recipe
@@ -55,20 +55,20 @@ def trained_before(weights: Weights, **how: bool) -> Weights:
 
 @pytest.mark.parametrize("hides", [pytest.param(0.0, marks=pytest.mark.full), 0.3])
 @pytest.mark.parametrize(
-    ("begin", "stages"),
+    ("begin", "stage"),
     [
-        ("none", BOTH),
-        ("same classes", BOTH),
-        ("same classes", ("rv",)),
-        ("same classes", ("head",)),
-        ("other classes", BOTH),
-        ("unmatched", BOTH),
-        ("unmatched", ("rv",)),
-        ("unmatched", ("head",)),
+        ("none", "all"),
+        ("same classes", "all"),
+        ("same classes", "rv"),
+        ("same classes", "head"),
+        ("other classes", "all"),
+        ("unmatched", "all"),
+        ("unmatched", "rv"),
+        ("unmatched", "head"),
     ],
 )
 def test_predict_gives_finished_weights_the_intensities_of_their_training(
-    own: Path, tmp_path: Path, begin: str, stages: tuple[str, ...], hides: float
+    own: Path, tmp_path: Path, begin: str, stage: Any, hides: float
 ) -> None:
     recipe = load_recipe(str(own / "recipe.yaml"))
     augment = replace(recipe.training.augment, no_intensity=hides)
@@ -83,22 +83,14 @@ def test_predict_gives_finished_weights_the_intensities_of_their_training(
     init = inits[begin]
 
     data = str(own / "robot.yaml")
-    plan = Plan.open(
-        recipe,
-        [data],
-        tmp_path / "run",
-        lambda dataset: split_records(dataset, None, None),
-        init,
-        stage="all" if stages == BOTH else stages[0],
-    )
-    weights = first_weights(plan, init, stages)
-    expects = expected_after(plan.scans, weights, plan.recipe, stages)
-    _, val = make_loaders(replace(plan, expects=expects), recipe.training.rv)
+    plan = Plan.open(recipe, [data], tmp_path / "run", to_train, init, stage=stage)
+    expects = expected_after(plan.data, first_weights(plan), plan.recipe, plan.stages)
+    _, val = make_loaders(plan, recipe.training.rv, expects)
     assert val is not None
     in_training = val.dataset[(0, 0)]
 
     dataset = normalised(open_dataset(data), Normaliser(expects))
-    scan = expects.prepare(dataset.read(plan.scans.val[0]))
+    scan = expects.prepare(dataset.read(plan.data.val[0]))
     np.testing.assert_allclose(scan.points, in_training.points, atol=1e-6)
 
 
@@ -134,10 +126,10 @@ def test_streets_that_are_joined_with_others_are_matched_as_streets_alone(
     for data in (specs[:1], specs):
         recipe = load_recipe(str(tmp_path / "recipe.yaml"))
         plan = Plan.open(
-            recipe, data, tmp_path / "run", lambda each: split_records(each, ["0"], ["900000"])
+            recipe, data, tmp_path / "run", lambda each: to_train(each, ["0"], ["900000"])
         )
-        weights = Weights(recipe.model, plan.scans.dataset.taxonomy)
-        found.append(expected_after(plan.scans, weights, plan.recipe, plan.stages).intensity)
+        weights = Weights(recipe.model, plan.data.taxonomy)
+        found.append(expected_after(plan.data, weights, plan.recipe, plan.stages).intensity)
     assert found[0].is_matched
     assert found[0].is_optional  # a quarter of the streets hide their intensities
     assert found[0] == found[1]

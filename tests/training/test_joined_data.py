@@ -15,10 +15,11 @@ from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import AugmentConfig, Recipe
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.base import ScanRecord
-from amvnet.data.datasets.joined import MixedRecord, join
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
-from amvnet.data.datasets.select import TrainingScans, all_to_train, split_records
+from amvnet.data.datasets.select import to_mix_in, to_train
+from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.inference.reading import normalised
@@ -54,66 +55,52 @@ from fixtures.tiny import (
 )
 
 
-def joined(tmp_path: Path, share: float, first: int = 4, second: int = 14) -> TrainingScans:
+def mixed(tmp_path: Path, share: float, first: int = 4, second: int = 14) -> TrainingData:
     a = open_dataset(str(make_streets(tmp_path / "a", ("00", "08"), first)))
     b = open_dataset(str(make_streets(tmp_path / "b", ("00",), second)))
-    scans = TrainingScans(a, a.records(["00"]), a.records(["08"]))
-    return join(scans, [TrainingScans(b, b.records(["00"]), [])], share)
+    sources = [Source(a, a.records(["00"]), a.records(["08"])), Source(b, b.records(["00"]))]
+    return TrainingData(sources, share)
 
 
 def test_without_a_share_every_scan_is_in_every_epoch(tmp_path: Path) -> None:
-    scans = joined(tmp_path, 0)
-    assert len(scans.train) == 4 + 14
+    data = mixed(tmp_path, 0)
+    assert len(data) == len(data.train) == 4 + 14
     for epoch in range(3):
-        originals = set()
-        for record in scans.train:
-            turn = scans.dataset.at_epoch(record, epoch)
-            if isinstance(turn, MixedRecord):
-                originals.add(turn.original.name)
-        assert len(originals) == 14
+        assert len({record.name for record in data.in_epoch(1, epoch)}) == 14
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.75])
 def test_a_share_is_that_of_an_epoch(tmp_path: Path, share: float) -> None:
-    scans = joined(tmp_path, share)
-    mixed = sum(isinstance(record, MixedRecord) for record in scans.train)
-    assert mixed / len(scans.train) == pytest.approx(share, abs=0.05)
-    assert [record.sequence for record in scans.val] == ["08"] * 4
+    data = mixed(tmp_path, share)
+    assert data.places[1] / len(data) == pytest.approx(share, abs=0.05)
+    assert [record.sequence for record in data.val] == ["08"] * 4
 
 
 def test_all_scans_of_a_mixed_dataset_take_equally_many_turns(tmp_path: Path) -> None:
-    scans = joined(tmp_path, 0.5)
+    data = mixed(tmp_path, 0.5)
     counts: Counter[str] = Counter()
     for epoch in range(14 // 2):  # the lowest number of epochs that is a multiple for 4 places
-        for record in scans.train:
-            record = scans.dataset.at_epoch(record, epoch)
-            if isinstance(record, MixedRecord):
-                counts[record.original.name] += 1
+        counts.update(record.name for record in data.in_epoch(1, epoch))
     assert len(counts) == 14
     assert set(counts.values()) == {2}
 
 
 def test_a_mixed_scan_is_read_from_its_own_dataset(tmp_path: Path) -> None:
-    scans = joined(tmp_path, 0)
+    data = mixed(tmp_path, 0)
     b = open_dataset(str(tmp_path / "b"))
-    record = scans.dataset.at_epoch(scans.train[7], 2)
-    assert isinstance(record, MixedRecord)
-    expected = b.read(record.original)
-    scan = scans.dataset.read(record)
+    expected = b.read(data.in_epoch(1, 2)[3])
+    scan = data.read(4 + 3, epoch=2)
     np.testing.assert_array_equal(scan.points, expected.points)
     np.testing.assert_array_equal(scan.labels, expected.labels)
 
 
 def test_points_keep_their_dataset_as_their_source_when_scans_are_mixed(tmp_path: Path) -> None:
-    scans = joined(tmp_path, 0.5)
-    own, other = scans.train[0], scans.train[-1]
-    assert isinstance(other, MixedRecord)
+    data = mixed(tmp_path, 0.5)
     parts = []
-    for record, label in ((own, 3), (other, 9)):
-        scan = scans.dataset.read(record)
+    for index, label in ((0, 3), (len(data) - 1, 9)):
+        scan = data.read(index)
         parts.append(replace(scan, labels=np.full(len(scan), label, np.uint8)))
-    mixed = mix(parts[0], parts[1], np.random.default_rng(0))
-    _, labels, source = collate([mixed])
+    _, labels, source = collate([mix(parts[0], parts[1], np.random.default_rng(0))])
     assert set(zip(labels.tolist(), source.tolist(), strict=True)) == {(3, 0), (9, 1)}
 
 
@@ -127,14 +114,10 @@ def test_the_check_finds_the_classes_that_only_other_datasets_have(
         raw.tofile(path)
     a = open_dataset(str(tmp_path / "a"))
     b = open_dataset(str(make_streets(tmp_path / "b", ("00",), 14)))
-    own = TrainingScans(a, a.records(["00"]), [])
     lines: list[str] = []
-    plan = Plan(
-        load_recipe("semantickitti-compact"),
-        join(own, [TrainingScans(b, b.records(["00"]), [])], 0.5),
-        tmp_path / "run",
-        report=lines.append,
-    )
+    data = TrainingData([Source(each, each.records(["00"])) for each in (a, b)], 0.5)
+    recipe = load_recipe("semantickitti-compact")
+    plan = Plan(recipe, data, tmp_path / "run", report=lines.append)
     _, taught = check_data(plan)
     car = SEMANTICKITTI.classes.index("car")
     assert taught[1, car]
@@ -168,13 +151,9 @@ def test_streets_are_not_taken_to_lack_the_classes_of_later_epochs(
         raw.tofile(path)
     a = open_dataset(str(tmp_path / "a"))
     streets = open_dataset(f"simulated-hdl64e:{tmp_path / 'streets'}")
-    others = [TrainingScans(streets, streets.records(["0", "1"]), [])]
-    plan = Plan(
-        load_recipe("semantickitti-compact"),
-        join(TrainingScans(a, a.records(["00"]), []), others, 0.5),
-        tmp_path / "run",
-    )
-    _, taught = check_data(plan)
+    sources = [Source(a, a.records(["00"])), Source(streets, streets.records(["0", "1"]))]
+    recipe = load_recipe("semantickitti-compact")
+    _, taught = check_data(Plan(recipe, TrainingData(sources, 0.5), tmp_path / "run"))
     assert taught[1].all()
     assert taught[0, SEMANTICKITTI.classes.index("pole")]
 
@@ -182,30 +161,29 @@ def test_streets_are_not_taken_to_lack_the_classes_of_later_epochs(
 def test_scans_that_are_mixed_into_others_are_of_the_same_epoch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scans = joined(tmp_path, 0.5)
     epochs = []
-    at_epoch = scans.dataset.at_epoch
+    at_epoch = SemanticKitti.at_epoch
 
-    def record_epoch(record: ScanRecord, epoch: int) -> ScanRecord:
+    def record_epoch(self: SemanticKitti, record: ScanRecord, epoch: int) -> ScanRecord:
         epochs.append(epoch)
-        return at_epoch(record, epoch)
+        return at_epoch(self, record, epoch)
 
-    monkeypatch.setattr(scans.dataset, "at_epoch", record_epoch)
+    monkeypatch.setattr(SemanticKitti, "at_epoch", record_epoch)
     augmented = AugmentConfig(mix=1, laser_mix=1, paste=1)
-    assert len(ScanSet(scans.dataset, scans.train, Expectation(), augmented)[5, 0])
+    assert len(ScanSet(mixed(tmp_path, 0.5), Expectation(), augmented)[5, 0])
     assert epochs == [5] * 4  # the scan, and one for each way to mix
 
 
 def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: Path) -> None:
     a = open_dataset(str(make_streets(tmp_path / "a")))
-    scans = TrainingScans(a, a.records(["00"]), [])
+    first = Source(a, a.records(["00"]))
     nuscenes = open_dataset(f"nuscenes:{GOLDEN / 'nuscenes'}")
     assert nuscenes.taxonomy == NUSCENES
-    other = TrainingScans(nuscenes, nuscenes.records(nuscenes.sequences("all")), [])
+    other = Source(nuscenes, nuscenes.records(nuscenes.sequences("all")))
     with pytest.raises(InputError, match="classes"):
-        join(scans, [other])
+        TrainingData([first, other])
     with pytest.raises(InputError, match="share below 1"):
-        join(scans, [TrainingScans(a, a.records(["08"]), [])], share=1.0)
+        TrainingData([first, Source(a, a.records(["08"]))], share=1.0)
 
 
 @pytest.fixture
@@ -233,14 +211,13 @@ def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_f
     assert "state under sensor" in advice
     records = first.records(first.sequences("all"))
 
-    scans = join(TrainingScans(first, records, ()), [all_to_train(second)])
+    data = TrainingData([Source(first, records), to_mix_in(second)])
 
     view = RangeView(weights.model.range_view)
-    mixed = [record for record in scans.train if isinstance(record, MixedRecord)]
-    assert len(mixed) == 2
-    for record in mixed:
-        batch = PointBatch.of([scans.dataset.read(record)])
-        as_is = PointBatch.of([open_dataset(str(streets)).read(record.original)])
+    assert data.places[1] == 2
+    for place, record in enumerate(data.in_epoch(1)):
+        batch = PointBatch.of([data.read(len(records) + place)])
+        as_is = PointBatch.of([open_dataset(str(streets)).read(record)])
         assert torch.equal(view.rows(batch), view.rows(as_is))
 
 
@@ -267,10 +244,10 @@ def test_ones_own_scans_are_brought_to_the_initial_weights_rather_than_to_earlie
 
 def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) -> None:
     """Scans with rows and scans without are mixed point by point."""
-    scans = joined(tmp_path, 0)
     own = normalised(open_dataset(str(own_file)), Normaliser(fresh_weights().expects))
-    mixed = join(scans, [TrainingScans(own, own.records(own.sequences("all")), [])])
-    a, b = (mixed.dataset.read(record) for record in (mixed.train[0], mixed.train[-1]))
+    sources = [*mixed(tmp_path, 0).sources, Source(own, own.records(own.sequences("all")))]
+    data = TrainingData(sources)
+    a, b = (data.read(index) for index in (0, len(data) - 1))
     assert a.row is None
     assert b.row is not None
 
@@ -290,14 +267,13 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
     paths = [make_own_scans(tmp_path / name) for name in "ab"]
     weights = fresh_weights(open_own(paths[0]).taxonomy)
     own = [normalised(open_dataset(str(path)), Normaliser(weights.expects)) for path in paths]
-    a, b = [TrainingScans(each, each.records(each.sequences("train")), ()) for each in own]
+    a, b = [Source(each, each.records(each.sequences("train"))) for each in own]
 
-    def expected(scans: TrainingScans) -> Expectation:
-        return expected_after(scans, weights, Recipe(), ("rv", "bev"))
+    def expected(*sources: Source) -> Expectation:
+        return expected_after(TrainingData(sources), weights, Recipe(), ("rv", "bev"))
 
-    both = expected(join(a, [b]))
-    assert not both.as_is
-    assert both.sensor == expected(a).sensor
+    assert not expected(a, b).as_is
+    assert expected(a, b).sensor == expected(a).sensor
 
 
 @pytest.fixture(scope="module")
@@ -389,35 +365,34 @@ def test_a_fine_tuning_needs_weights(world: Path, tmp_path: Path) -> None:
 def test_scans_without_labels_are_not_mixed_in(world: Path, tmp_path: Path) -> None:
     data = make_streets(tmp_path / "b", ("00",), 3)
     (data / "sequences/00/labels/000001.label").unlink()
-    names = [record.name for record in all_to_train(open_dataset(str(data))).train]
+    names = [record.name for record in to_mix_in(open_dataset(str(data))).train]
     assert names == ["00/000000", "00/000002"]
 
 
 def test_all_sequences_of_another_dataset_are_mixed_in_if_it_has_no_split(tmp_path: Path) -> None:
     data = open_dataset(str(make_streets(tmp_path / "b", ("00", "01", "02"), 2)))
     (data.root / "sequences/01/labels/000001.label").unlink()
-    scans = all_to_train(data)
-    assert len(scans.train) == 5
-    assert [record.name for record in scans.unlabelled] == ["01/000001"]
+    source = to_mix_in(data)
+    assert len(source.train) == 5
+    assert [record.name for record in source.unlabelled] == ["01/000001"]
 
 
 def test_scans_to_validate_with_are_not_mixed_in_under_another_name(tmp_path: Path) -> None:
     data = make_streets(tmp_path / "b", ("00", "01"), 2)
     (tmp_path / "c").symlink_to(data)
     first, second = open_dataset(str(data)), open_dataset(str(tmp_path / "c"))
-    scans = split_records(first, ["00"], ["01"])
-    others = [TrainingScans(second, second.records(["00"]), [])]
-    assert len(join(scans, others).train) == 4
+    source = to_train(first, ["00"], ["01"])
+    assert len(TrainingData([source, Source(second, second.records(["00"]))])) == 4
     with pytest.raises(InputError, match=r"000000\.bin among both; leave it out of"):
-        join(scans, [all_to_train(second)])
+        TrainingData([source, to_mix_in(second)])
 
 
 def test_scans_of_the_test_split_are_not_mixed_in_either(tmp_path: Path) -> None:
     data = make_streets(tmp_path / "b", ("00", "08", "11"), 1)
     first = open_dataset(str(data))
-    same = TrainingScans(first, first.records(["11"]), [])
+    same = Source(first, first.records(["11"]))
     with pytest.raises(InputError, match="apart from those to validate or to test with"):
-        join(split_records(first, None, None), [same])
+        TrainingData([to_train(first), same])
 
 
 def test_scans_of_a_bag_are_told_apart_by_their_names_in_it(tmp_path: Path) -> None:
@@ -426,16 +401,16 @@ def test_scans_of_a_bag_are_told_apart_by_their_names_in_it(tmp_path: Path) -> N
         [replace(record, points_path=tmp_path / "d.mcap", name=f"d/{folder}/000000")]
         for folder, record in zip("ab", data.records(["00", "01"]), strict=True)
     )
-    scans = TrainingScans(data, data.records(["00"]), val)
-    assert join(scans, [TrainingScans(data, train, [])])
+    source = Source(data, data.records(["00"]), val)
+    assert TrainingData([source, Source(data, train)])
     with pytest.raises(InputError, match=r"d\.mcap among both"):
-        join(scans, [TrainingScans(data, val, [])])
+        TrainingData([source, Source(data, val)])
 
 
 def test_other_data_without_a_scan_to_train_on_is_refused(tmp_path: Path) -> None:
     data = open_dataset(str(make_streets(tmp_path / "b", ("08",), 1)))
     with pytest.raises(InputError, match="found none outside val and test"):
-        all_to_train(data)
+        to_mix_in(data)
 
 
 def test_a_training_says_which_scans_of_others_no_epoch_shows(
@@ -465,7 +440,7 @@ def test_a_recipe_that_takes_the_model_of_init_refuses_another_one(tmp_path: Pat
 def test_any_classes_fit_a_recipe_that_takes_the_model_of_init(tmp_path: Path) -> None:
     """They get new last layers."""
     data = open_dataset(str(make_streets(tmp_path, ("00", "08"), 1)))
-    scans = split_records(data, None, None)
+    scans = TrainingData([to_train(data)])
     recipe = sized_by_init(load_recipe("finetune"), fresh_weights(NUSCENES))
     Plan(recipe, scans, tmp_path / "run")
     with pytest.raises(InputError, match="use the recipe of that benchmark"):

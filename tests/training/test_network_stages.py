@@ -16,14 +16,14 @@ from torch.nn import functional as F
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import ModelConfig, NetworkTraining, Recipe, TrainingConfig
 from amvnet.data.datasets.base import ScanRecord
-from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.loaders import ScanSet
-from amvnet.training.losses import Targets, dice, distillation_loss, lovasz_softmax, rival_classes
+from amvnet.training.losses import Targets, dice, distillation_loss, lovasz_softmax
 from amvnet.training.networks import PolarStage, make_loaders, make_stage
 from amvnet.training.plan import Plan
 from amvnet.training.stage import Precision
@@ -32,14 +32,14 @@ from fixtures.tiny import MODEL, street
 
 CONFIG = NetworkTraining(epochs=1, batch=2, lr=1e-3)
 MODEL_CONFIG = from_dict(ModelConfig, MODEL)
+ALL = np.ones((2, 19), bool)  # both datasets teach all classes
 
 
-def plan_with(config: NetworkTraining, taught: np.ndarray | None = None) -> Plan:
+def plan_with(config: NetworkTraining) -> Plan:
     """Return a plan without scans, in which both networks are trained alike."""
     training = replace(TrainingConfig(), rv=config, bev=config)
     dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
-    scans = TrainingScans(dataset, [], [])
-    return Plan(Recipe(training=training), scans, Path("run"), taught=taught)
+    return Plan(Recipe(training=training), TrainingData([Source(dataset, [])]), Path("run"))
 
 
 def polar_stage() -> PolarStage:
@@ -87,7 +87,7 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
 def test_pixels_and_voxels_have_the_source_of_their_points(stage: str) -> None:
     """The source is the scan here, so that no pixel and no voxel has points of two sources."""
     batch, labels = batch_of_two()
-    made = make_stage(plan_with(CONFIG), stage, build_amvnet(MODEL_CONFIG, 19), None).eval()
+    made = make_stage(plan_with(CONFIG), stage, build_amvnet(MODEL_CONFIG, 19), None, ALL).eval()
     with torch.no_grad():
         scored = made.compare((batch, labels, batch.scan))
     assert scored.source is not None
@@ -117,7 +117,7 @@ def test_a_network_alone_computes_in_the_lower_precision(
     model = build_amvnet(replace(MODEL_CONFIG, range_view=view), 19)
     plan = plan_with(CONFIG)
     training = replace(plan.recipe.training, precision=precision)
-    made = make_stage(replace(plan, recipe=Recipe(training=training)), stage, model, None)
+    made = make_stage(replace(plan, recipe=Recipe(training=training)), stage, model, None, ALL)
     types: list[torch.dtype] = []
 
     def note(net: nn.Module, inputs: Any, output: torch.Tensor) -> None:
@@ -133,10 +133,10 @@ def test_a_network_alone_computes_in_the_lower_precision(
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> None:
-    present = np.ones((2, 19), bool)
+    present = ALL.copy()
     present[0, 4] = False
     model = build_amvnet(MODEL_CONFIG, 19)
-    made: Any = make_stage(plan_with(CONFIG, rival_classes(present)), stage, model, None).eval()
+    made: Any = make_stage(plan_with(CONFIG), stage, model, None, present).eval()
     made.log = lambda *_, **__: None
     made.step_factor = lambda *_: 1.0
     batch, labels = batch_of_two()
@@ -155,10 +155,11 @@ def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> No
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(stage: str) -> None:
     config = replace(CONFIG, distill=2.0)
-    taught = np.ones((2, 19), bool)
-    assert not make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), None).teachers
+    plan, model = plan_with(config), build_amvnet(MODEL_CONFIG, 19)
+    assert not make_stage(plan, stage, model, None, ALL).teachers
+    taught = ALL.copy()
     taught[0, 4] = False
-    made: Any = make_stage(plan_with(config, taught), stage, build_amvnet(MODEL_CONFIG, 19), None)
+    made: Any = make_stage(plan, stage, model, None, taught)
     made.log = lambda *_, **__: None
     made.step_factor = lambda *_: 1.0
     (teacher,) = made.teachers
@@ -203,7 +204,7 @@ def test_the_loss_of_a_stage_equals_its_formula_with_all_weights(
     of_paper = {"rv": dice, "bev": lovasz_softmax}[stage]
     region_loss = {"default": of_paper, "dice": dice, "lovasz": lovasz_softmax}[name]
     weights = np.linspace(0.2, 3, 19, dtype=np.float32)
-    made = make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), weights)
+    made = make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), weights, ALL)
 
     batch, labels = batch_of_two()
     with torch.no_grad():
@@ -227,10 +228,8 @@ def test_validation_scans_are_read_like_training_scans_and_not_augmented() -> No
         path = Path(f"{name}.bin")
         records.append(ScanRecord(name, "00", path, None, prediction=f"{name}.label"))
     expects = Expectation(view)
-    scans = TrainingScans(dataset, records[:1], records[1:])
-    plan = Plan(recipe, scans, Path("run"), expects=expects)
-
-    train, val = make_loaders(plan, CONFIG)
+    data = TrainingData([Source(dataset, records[:1], records[1:])])
+    train, val = make_loaders(Plan(recipe, data, Path("run")), CONFIG, expects)
     assert val is not None
     for loader, is_augmented in ((train, True), (val, False)):
         loaded = loader.dataset

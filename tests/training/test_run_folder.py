@@ -7,9 +7,8 @@ from pathlib import Path
 import yaml
 
 from amvnet.config.schema import Recipe
-from amvnet.data.datasets.joined import join
 from amvnet.data.datasets.own import open_own
-from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import (
     LAST,
@@ -54,18 +53,18 @@ def test_settings_tell_classes_apart_by_names_order_and_ids(tmp_path: Path) -> N
     for classes in ({"a": 1, "b": 2}, {"b": 2, "a": 1}, {"a": 2, "b": 1}, {"a": 1, "c": 2}):
         path = tmp_path / f"{len(found)}.yaml"
         path.write_text(yaml.safe_dump({"classes": classes, "scans": "*.bin"}, sort_keys=False))
-        scans = TrainingScans(open_own(path), [], [])
-        settings = stage_settings(Plan(Recipe(), scans, tmp_path / "run"), "rv", fresh_weights())
+        data = TrainingData([Source(open_own(path), [])])
+        settings = stage_settings(Plan(Recipe(), data, tmp_path / "run"), "rv", fresh_weights())
         found.add(settings["classes"])
     assert len(found) == 4
 
     # The ids of further datasets count, too.
     first, second = (
-        TrainingScans(data, data.records(data.sequences("all")), [])
-        for data in (open_own(tmp_path / f"{number}.yaml") for number in (0, 2))
+        Source(dataset, dataset.records(dataset.sequences("all")))
+        for dataset in (open_own(tmp_path / f"{number}.yaml") for number in (0, 2))
     )
     for other in (first, second):
-        plan = Plan(Recipe(), join(first, [other]), tmp_path / "run")
+        plan = Plan(Recipe(), TrainingData([first, other]), tmp_path / "run")
         found.add(stage_settings(plan, "rv", fresh_weights())["classes"])
     assert len(found) == 6
 

@@ -23,7 +23,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES, SIMULATED_QUANTILES, TrainedIntensity
@@ -179,9 +179,9 @@ def test_the_check_of_the_scans_reports_ten_times(
 ) -> None:
     monkeypatch.setattr("amvnet.progress.QUIET_SECONDS", 0)
     dataset = open_dataset(str(make_streets(tmp_path / "data", ("00", "08"), 23)))
-    scans = TrainingScans(dataset, dataset.records(["00"]), [])
+    data = TrainingData([Source(dataset, dataset.records(["00"]))])
     lines: list[str] = []
-    plan = Plan(load_recipe("semantickitti-compact"), scans, tmp_path / "run", report=lines.append)
+    plan = Plan(load_recipe("semantickitti-compact"), data, tmp_path / "run", report=lines.append)
     check_data(plan)
     checked = [line.partition(": checked")[2] for line in lines if ": checked" in line]
     assert len(checked) == 10
@@ -586,10 +586,10 @@ def test_two_stages_trained_at_the_same_time_are_both_kept(
     save(fresh_weights(), tmp_path / "start.safetensors")
     options = ["--init", tmp_path / "start.safetensors", "--training.rv.epochs", 1]
 
-    def train_beside(plan: Plan, name: str, weights: Weights) -> None:
+    def train_beside(*stage: Any) -> None:
         monkeypatch.setattr(training_run, "train_network", train_network)
         train(world, tmp_path / "run", "--stage", "rv", *options)
-        train_network(plan, name, weights)
+        train_network(*stage)
 
     monkeypatch.setattr(training_run, "train_network", train_beside)
     weights = train(world, tmp_path / "run", "--stage", "bev", *options)
@@ -818,9 +818,9 @@ def test_the_handler_of_sigterm_during_a_training_is_that_of_the_process(
 ) -> None:
     handlers: dict[str, Any] = {}
 
-    def note(plan: Plan, name: str, weights: Weights) -> None:
+    def note(*stage: Any) -> None:
         handlers["before"] = signal.getsignal(signal.SIGTERM)
-        train_network(plan, name, weights)
+        train_network(*stage)
 
     def note_within(self: NetworkStage, optimizer: Any) -> None:
         handlers["within"] = signal.getsignal(signal.SIGTERM)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -16,7 +15,7 @@ from amvnet.progress import counted
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
-    from amvnet.data.datasets.select import TrainingScans
+    from amvnet.data.datasets.training_data import Source
     from amvnet.inference.drive import DriveChoice
     from amvnet.inference.listing import ScanOptions
     from amvnet.inference.request import LabellingRequest
@@ -102,7 +101,7 @@ class TrainingChoice:
     """sequences or scenes to validate with, separated by commas; default: the sequences of the
     split, or the last sequence if there is no split."""
 
-    def scans(self, dataset: Dataset, with_val: bool = False) -> TrainingScans:
+    def source(self, dataset: Dataset, with_val: bool = False) -> Source:
         """Return the labelled scans to train on and to validate with.
 
         Scans that are not used are reported.
@@ -113,51 +112,48 @@ class TrainingChoice:
         Raises:
             InputError: if there are no such sequences, or no scans to train on.
         """
-        from amvnet.data.datasets.select import split_records
+        from amvnet.data.datasets.select import to_train
 
-        scans = split_records(dataset, self.train_sequences, self.val_sequences, with_val)
-        report_unused(scans)
-        return scans
+        source = to_train(dataset, self.train_sequences, self.val_sequences, with_val)
+        report_unused(source)
+        return source
 
-    def splits(self, dataset: Dataset) -> Iterator[tuple[str, Sequence[ScanRecord]]]:
-        """Yield the name of each split and its scans, including scans without labels.
+    def splits(self, dataset: Dataset) -> dict[str, list[ScanRecord]]:
+        """Return the scans of each split by its name, including scans without labels.
 
         Scans that the split does not name are reported.
 
         Raises:
-            InputError: as `scans`.
+            InputError: as `source`.
         """
-        from amvnet.data.datasets.select import named_sequences, split_records
+        from amvnet.data.datasets.select import named_sequences
+        from amvnet.data.datasets.training_data import Source
 
-        _report_unnamed(split_records(dataset, self.train_sequences, self.val_sequences))
         train, val = named_sequences(dataset, self.train_sequences, self.val_sequences)
-        yield "train", dataset.records(train)
-        yield "val", dataset.records(val)
-        with suppress(InputError):  # there may be no test split
-            yield "test", dataset.labelled(dataset.records(dataset.official("test")))
+        _report_unnamed(Source.labelled(dataset, train, val))
+        splits = {"train": dataset.records(train), "val": dataset.records(val)}
+        test = dataset.having_labels(dataset.records(dataset.splits().get("test", ())))
+        return splits | ({"test": test} if test else {})
 
 
-def report_unused(scans: TrainingScans, title: str = "") -> None:
+def report_unused(source: Source, title: str = "") -> None:
     """Report the scans of a dataset that a training does not use.
 
     Args:
         title: the beginning of each line.
     """
-    if scans.unlabelled:
-        report(f"{title}skipped for lack of labels: {describe_records(scans.unlabelled)}")
-    _report_unnamed(scans, title)
+    if source.unlabelled:
+        report(f"{title}skipped for lack of labels: {describe_records(source.unlabelled)}")
+    _report_unnamed(source, title)
 
 
-def _report_unnamed(scans: TrainingScans, title: str = "") -> None:
-    """Report the scans of a user's dataset that its split does not name."""
-    from amvnet.data.datasets.own import OwnScans
-
-    if isinstance(scans.dataset, OwnScans):
-        used = {record.name for record in (*scans.train, *scans.val)}
-        unnamed = [record for record in scans.dataset.left_out() if record.name not in used]
-        if unnamed:
-            text = describe_records(unnamed)
-            report(f"{title}not used, because the split does not name them: {text}")
+def _report_unnamed(source: Source, title: str = "") -> None:
+    """Report the scans of a dataset that its split does not name."""
+    used = {record.name for record in (*source.train, *source.val)}
+    unnamed = [record for record in source.dataset.left_out() if record.name not in used]
+    if unnamed:
+        text = describe_records(unnamed)
+        report(f"{title}not used, because the split does not name them: {text}")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.cloud import require_columns
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
@@ -113,14 +112,12 @@ def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
     Raises:
         InputError: if the YAML file describes an impossible sensor.
     """
-    if not isinstance(dataset, OwnScans):
-        return dataset
-    if dataset.description.sensor is not None and normaliser.sensor == Sensor():
+    if dataset.described_sensor is not None and normaliser.sensor == Sensor():
         with errors_of(f"{dataset.spec}: sensor"):
-            sensor = make_sensor(dataset.description.sensor)
+            sensor = make_sensor(dataset.described_sensor)
         normaliser = normaliser.for_sensor(sensor)
 
     for source, scans in dataset.recordings().items():
         for scan in scans:
             normaliser.expect(source, scan.read)
-    return OwnScans(dataset.description, normaliser)
+    return dataset.normalised_by(normaliser)

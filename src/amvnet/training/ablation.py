@@ -45,14 +45,15 @@ def sweep_heads(
     Raises:
         InputError: if a folder holds a head for other networks, other scans or another recipe.
     """
-    dataset = plan.scans.dataset
+    dataset = plan.data.sources[0].dataset
     for value, model in models.items():
         networks = _networks(weights, model)
         recipe = dataclasses.replace(plan.recipe, model=model)
-        head_plan = dataclasses.replace(plan, recipe=recipe, out=plan.out / f"{value:g}")
+        out = plan.out / f"{value:g}"
+        head_plan = dataclasses.replace(plan, recipe=recipe, out=out, init=networks, stage="head")
 
-        segmenter = load(train(head_plan, "head", networks), device)
-        evaluation = evaluate(dataset, plan.scans.val, label_by_weights(dataset, segmenter))
+        segmenter = load(train(head_plan), device)
+        evaluation = evaluate(dataset, plan.data.val, label_by_weights(dataset, segmenter))
         uncertain = evaluation.uncertain / max(evaluation.asked, 1)
         yield swept_row(value, uncertain, evaluation.matrices["amvnet"][0], dataset.taxonomy)
 
@@ -100,17 +101,13 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
         name = _name(gru, weighted)
         plan.report(f"{name}:")
         recipe = _ablated(plan.recipe, gru, weighted)
-        path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name), "rv")
+        path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name, stage="rv"))
 
         segmenter = load(path, plan.processes.device(choose_device(device)), "rv")
-        scans = plan.scans
-        evaluation = evaluate(
-            scans.dataset,
-            scans.val,
-            label_by_weights(scans.dataset, segmenter),
-            processes=plan.processes,
-        )
-        yield gru, weighted, metrics(evaluation.matrices["rv"][0], scans.dataset.taxonomy)
+        dataset = plan.data.sources[0].dataset
+        labeller = label_by_weights(dataset, segmenter)
+        evaluation = evaluate(dataset, plan.data.val, labeller, processes=plan.processes)
+        yield gru, weighted, metrics(evaluation.matrices["rv"][0], dataset.taxonomy)
 
 
 def _name(gru: bool, weighted: bool) -> str:

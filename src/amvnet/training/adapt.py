@@ -13,7 +13,7 @@ import numpy as np
 
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import Recipe
-from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
+from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, inside, temporary_folder
@@ -76,10 +76,10 @@ class TaughtScans(Dataset):
         super().__init__(folder, weights.taxonomy)
         self._scans = {label_path(scan): scan for scan in scans}
 
-    def official(self, split: str) -> tuple[str, ...]:
+    def splits(self) -> dict[str, tuple[str, ...]]:
         """Return the recordings; all of them train."""
-        check_split(self.spec, split, ("train", "all"))
-        return tuple(dict.fromkeys(scan.source for scan in self._scans.values()))
+        recordings = tuple(dict.fromkeys(scan.source for scan in self._scans.values()))
+        return {"train": recordings, "all": recordings}
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of some recordings, in order."""
@@ -237,7 +237,7 @@ def adapt(
             part.rename(folder)
     report(f"before: {before}")
 
-    path = train(make_plan(TaughtScans(scans, folder, weights)), "all", weights)
+    path = train(make_plan(TaughtScans(scans, folder, weights)))
     with progress("comparing") as step:
         after = teach(scans, drives, make_segmenter(load(path)), progress=step)
     report(f"after: {after}")

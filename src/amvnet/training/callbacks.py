@@ -102,10 +102,9 @@ class KeepWeights(Callback):
     """
 
     def __init__(self, plan: Plan, name: str, weights: Weights) -> None:
-        assert plan.expects is not None
         self.folder = plan.out / name
         self.part = PART_OF[name]
-        self.weights = dataclasses.replace(weights, expects=plan.expects)
+        self.weights = weights
         self.settings = stage_settings(plan, name, weights)
         self.record = stage_record(plan, self.settings)
         self.started = time.monotonic()  # unlike the system's clock, it is never set back

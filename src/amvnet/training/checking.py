@@ -1,20 +1,30 @@
-"""Check the scans of a training before its first epoch, and count the points of each class."""
+"""Check a training before its first epoch: its folder, its weights to begin with, and its scans."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from amvnet.config.nested import flat, to_dict
 from amvnet.data.check import Report, check_scans
-from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.joined import Joined, MixedRecord
-from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.data.datasets.base import Dataset
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.progress import Progress, Tenths, counted
+from amvnet.sensors.expectation import Expectation
+from amvnet.training.expectation import expected_after
 from amvnet.training.plan import Plan
-from amvnet.training.run_folder import COUNTS
+from amvnet.training.run_folder import (
+    COUNTS,
+    PART_OF,
+    check_begun,
+    stage_settings,
+    stages_of_folder,
+    with_finished,
+)
+from amvnet.weights.file import Weights
+from amvnet.weights.parts import SIZES, fits, for_classes, replace_part
 
 SHOWN_SCANS = 3  # largest number of broken scans that a message names
 # A dataset teaches a class if more than this share of its labelled points have it. A few points may
@@ -22,26 +32,134 @@ SHOWN_SCANS = 3  # largest number of broken scans that a message names
 STRAY_SHARE = 1e-5
 
 
+@dataclass(frozen=True)
+class Checked:
+    """What the check of a plan has found.
+
+    Attributes:
+        weights: the weights to begin with: new ones, with the parts of `Plan.init`, and the parts
+            that finished stages of the folder have trained.
+        expects: what the networks expect of a scan.
+        class_counts: (K,) int64, the number of points of each class in the training scans of an
+            epoch.
+        taught: (M, K) bool, whether each of the M datasets teaches each class, as `rival_classes`
+            takes it.
+    """
+
+    weights: Weights
+    expects: Expectation
+    class_counts: np.ndarray
+    taught: np.ndarray
+
+
+def check(plan: Plan) -> Checked:
+    """Check all stages of a plan before anything is written, and before hours are spent on one.
+
+    Raises:
+        InputError: if a stage cannot begin or be resumed, the weights to begin with do not fit, or
+            `check_data` finds an error.
+    """
+    weights = first_weights(plan)
+    for name in plan.stages:
+        check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
+        _check_initial(plan, name)
+    counts, taught = check_data(plan)
+    plan.processes.wait()  # until all streets of the first epoch are simulated
+    expects = plan.expects or expected_after(plan.data, weights, plan.recipe, plan.stages)
+    return Checked(weights, expects, counts, taught)
+
+
+def first_weights(plan: Plan) -> Weights:
+    """Return new weights with the parts of `init`, and the parts that the folder has finished.
+
+    If `init` has other classes, its parts are only taken for the stages to train.
+    """
+    sensor = plan.recipe.sensor
+    expects = Expectation.of_sensor(sensor)
+    weights = Weights(plan.recipe.model, plan.data.taxonomy, sensor, expects)
+    init = plan.init
+    for name in stages_of_folder(plan):
+        part = PART_OF[name]
+        if init is None or part not in init.parts:
+            continue
+        # A new kind of head can be trained on the networks of any weights.
+        is_trained = name in plan.stages
+        if name == "head" and is_trained and not fits(init, part, plan.recipe.model):
+            plan.report("head: new, because the head of the initial weights has other sizes")
+            continue
+        if init.taxonomy.classes == weights.taxonomy.classes:
+            weights = replace_part(weights, part, init)
+            if not is_trained:
+                _report_kept(plan, init, part)
+        elif is_trained:
+            weights = replace_part(weights, part, _for_classes(plan, init, part))
+
+    return with_finished(plan, weights)
+
+
+def _report_kept(plan: Plan, init: Weights, part: str) -> None:
+    """Report the settings of a part that is not trained, if the recipe has others."""
+    of_recipe = dict(flat(to_dict(plan.recipe.model), "model"))
+    kept = []
+    for section in SIZES[part]:
+        for key, value in flat(to_dict(getattr(init.model, section)), f"model.{section}"):
+            if value != of_recipe[key]:
+                kept.append(f"{key} is {value}, not {of_recipe[key]}")
+    if kept:
+        plan.report(f"{part}: is not trained, so it stays as in --init: {'; '.join(kept)}")
+
+
+def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
+    """Return the initial weights with new last layers for the classes of the dataset."""
+    taxonomy = plan.data.taxonomy
+    weights, new = for_classes(init, taxonomy, plan.recipe.training.seed)
+    of_part = [name for name in new if name.startswith(f"{part}.")]
+    plan.report(
+        f"{part}: the initial weights ({init.taxonomy.name}), with new layers for the classes of "
+        f"{taxonomy.name}: {', '.join(of_part)}"
+    )
+    return weights
+
+
+def _check_initial(plan: Plan, name: str) -> None:
+    """Raise InputError if a network needs initial weights that --init does not have."""
+    config = getattr(plan.recipe.training, name)
+    part = PART_OF[name]
+    parts = plan.init.parts if plan.init else ()
+    for option in ("initial", "distill"):
+        if getattr(config, option, 0) and part not in parts:
+            found = f"{', '.join(parts)} in --init" if parts else "none"
+            raise InputError(
+                f"training.{name}.{option}: expected weights of {part} to begin with, found "
+                f"{found}; give --init with this part, set the option to 0, or train another "
+                "--stage"
+            )
+
+
 def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """Check all labels of the scans of a training, and report what may be a mistake.
 
-    Of simulated streets, only those of the first epoch are checked.
+    Of simulated streets, only those of the first epoch are checked: the streets of later epochs are
+    simulated when they are needed, and may have other classes.
 
     Returns:
-        (K,) int64, the number of points of each class in the training scans of an epoch; and
-        (M, K) bool, whether each of the M datasets teaches each class, as `rival_classes` takes it.
+        The class counts and the taught classes, as in `Checked`.
 
     Raises:
         InputError: if a label has an unknown id, a scan cannot be read, or there is nothing to
             learn or to validate with.
     """
-    totals = np.zeros(plan.scans.dataset.taxonomy.size + 1, dtype=np.int64)
+    totals = np.zeros(plan.data.taxonomy.size + 1, dtype=np.int64)
     taught = []
-    for dataset, splits, counted_records in _datasets_of(plan):
+    for number, source in enumerate(plan.data.sources):
+        dataset = source.dataset
+        in_epoch = plan.data.in_epoch(number)
+        train = in_epoch if dataset.simulated_sensor else source.train
+        splits = {"train": train, "val": source.val}
         checked = check_scans(dataset, splits, _progress(plan, dataset), plan.processes)
         _refuse(checked)
-        totals += checked.count_points(counted_records)
-        if isinstance(dataset, SimulatedStreets):  # the streets of later epochs have other classes
+        totals += checked.count_points(in_epoch)
+        if dataset.simulated_sensor:
             taught.append(np.ones(len(totals) - 1, dtype=bool))
             continue
 
@@ -67,30 +185,9 @@ def _progress(plan: Plan, dataset: Dataset) -> Progress:
 
 def keep_counts(plan: Plan, counts: np.ndarray) -> None:
     """Write the (K,) counts of `check_data` into the folder of the run, for `weights.calibrate`."""
-    if plan.processes.first:
-        with atomic_write(plan.out / COUNTS) as part:
-            names = [record.name for record in plan.scans.train]
-            np.savez(part, counts=counts, scans=names, classes=plan.scans.dataset.taxonomy.classes)
-
-
-def _datasets_of(
-    plan: Plan,
-) -> Iterator[tuple[Dataset, Mapping[str, Sequence[ScanRecord]], Sequence[ScanRecord]]]:
-    """Yield each dataset of a training, its scans by split, and its scans in the first epoch."""
-    scans = plan.scans
-    dataset = scans.dataset
-    if not isinstance(dataset, Joined):
-        yield dataset, {"train": scans.train, "val": scans.val}, scans.train
-        return
-
-    mixed = [record for record in scans.train if isinstance(record, MixedRecord)]
-    own = [record for record in scans.train if not isinstance(record, MixedRecord)]
-    yield dataset.dataset, {"train": own, "val": scans.val}, own
-    for member, other in enumerate(dataset.others, start=1):
-        in_epoch = [record.original for record in mixed if record.member == member]
-        # The streets of later epochs are simulated when they are needed.
-        is_simulated = isinstance(other.dataset, SimulatedStreets)
-        yield other.dataset, {"train": in_epoch if is_simulated else other.train}, in_epoch
+    with atomic_write(plan.out / COUNTS) as part:
+        names = [record.name for record in plan.data.train]
+        np.savez(part, counts=counts, scans=names, classes=plan.data.taxonomy.classes)
 
 
 def _refuse(checked: Report) -> None:

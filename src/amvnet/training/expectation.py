@@ -9,9 +9,7 @@ from contextlib import suppress
 import numpy as np
 
 from amvnet.config.schema import Recipe
-from amvnet.data.datasets.own import OwnScans
-from amvnet.data.datasets.select import TrainingScans
-from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.data.datasets.training_data import TrainingData
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -58,12 +56,12 @@ def expected_before(
 
 
 def expected_after(
-    scans: TrainingScans, weights: Weights, recipe: Recipe, stages: Sequence[str]
+    data: TrainingData, weights: Weights, recipe: Recipe, stages: Sequence[str]
 ) -> Expectation:
     """Return what networks expect after their training, measured on its scans.
 
     Args:
-        scans: the scans to train on.
+        data: the scans to train on.
         weights: the weights that the training begins with.
         recipe: the recipe of the training.
         stages: the stages to train.
@@ -71,12 +69,12 @@ def expected_after(
     if set(NETWORK_OF.values()) & set(weights.parts) and not _networks(stages):
         return weights.expects  # a head takes what its networks take
 
-    first = scans.dataset.members[0]
-    sampled = _sample(scans)
+    first = data.sources[0].dataset
+    sampled = _sample(data)
     known = weights.expects
     as_is = True
     geometry = measure_sensor(sampled)
-    if isinstance(first, OwnScans) and isinstance(first.normalise, Normaliser):
+    if isinstance(first.normalise, Normaliser):
         # The weights will get scans that are normalised in the same way.
         known = first.normalise.expected or known
         as_is = False
@@ -84,8 +82,8 @@ def expected_after(
 
     intensity = known.intensity
     is_optional = intensity is not None and intensity.is_optional
-    if isinstance(first, SimulatedStreets):
-        simulated = SIMULATED_QUANTILES[first.sensor]
+    if first.simulated_sensor:
+        simulated = SIMULATED_QUANTILES[first.simulated_sensor]
         intensity = TrainedIntensity(simulated, is_optional, is_matched=True)
     elif intensity is None or (as_is and not intensity.is_matched):
         quantiles = _mean_quantiles(sampled)
@@ -102,12 +100,12 @@ def _networks(stages: Sequence[str]) -> set[str]:
     return {NETWORK_OF[name] for name in stages if name in NETWORK_OF}
 
 
-def _sample(scans: TrainingScans) -> list[Scan]:
+def _sample(data: TrainingData) -> list[Scan]:
     """Read some of the scans to train on, but no broken ones, which the training reports."""
     sample = []
-    for record in evenly_spaced(scans.train, SAMPLED_SCANS):
+    for index in evenly_spaced(range(len(data)), SAMPLED_SCANS):
         with suppress(InputError):
-            sample.append(scans.dataset.read(record, labels=False))
+            sample.append(data.read(index, labels=False))
     return sample
 
 

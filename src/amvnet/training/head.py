@@ -123,9 +123,9 @@ def train_head(plan: Plan, weights: Weights) -> None:
     # Gather the uncertain points of all scans, with their scores and neighbours.
     gatherer = PointGatherer(plan, weights)
     train = gatherer.gather(
-        plan.scans.train, folder / "train", config.views, tau=config.tau, report=plan.report
+        plan.data, folder / "train", config.views, tau=config.tau, report=plan.report
     )
-    val = gatherer.gather(plan.scans.val, folder / "val") if plan.scans.val else None
+    val = gatherer.gather(plan.data.to_validate(), folder / "val") if plan.data.val else None
 
     model = plan.build(weights)
     assert model.point_head is not None
@@ -134,7 +134,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
         train,
         val,
         config=config,
-        taxonomy=plan.scans.dataset.taxonomy,
+        taxonomy=plan.data.taxonomy,
         processes=plan.processes,
     )
     fit(stage, plan, _make_loaders(plan, train, val), weights)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from amvnet.config.schema import HeadTraining
 from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.training_data import TrainingData
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
 from amvnet.inference.scores import LEAST_PROBABILITY
@@ -159,7 +160,7 @@ class PointGatherer:
 
     def gather(
         self,
-        records: Sequence[ScanRecord],
+        data: TrainingData,
         folder: Path,
         views: int = 0,
         tau: float = 0.0,
@@ -171,7 +172,7 @@ class PointGatherer:
         labelled points instead.
 
         Args:
-            records: the scans.
+            data: the scans.
             folder: the folder that receives the points. Its earlier content is removed.
             views: how many times each scan is scored, each time with another augmentation. If it is
                 0, or the scores come from other models, each scan is taken once and unchanged.
@@ -185,9 +186,7 @@ class PointGatherer:
         if self.plan.scores is not None:
             views = 0
         augment = training.augment if views > 0 else None
-        assert self.plan.expects is not None
-        dataset = self.plan.scans.dataset
-        scans = ScanSet(dataset, records, self.plan.expects, augment, training.seed)
+        scans = ScanSet(data, self.weights.expects, augment, training.seed)
         keys = list(product(range(max(views, 1)), range(len(scans))))
         least = max(2, self.plan.processes.size)  # batch norm needs two points, a process one
 
@@ -307,7 +306,7 @@ class PointGatherer:
         batch = batch.to(device)
         labels = labels.to(device)
 
-        f, g = scorer(scans.records[key[1]], scan, batch)
+        f, g = scorer(scans.scans.train[key[1]], scan, batch)
         if scans.augment is not None:
             chance = self.plan.recipe.training.head.disturb
             rng = np.random.default_rng([*seeds, 1])

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.training_data import TrainingData
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.distributed import ALONE, Processes
@@ -46,11 +46,10 @@ class ScanSet(data.Dataset[Scan]):
     """Labelled scans by epoch and index.
 
     The augmentation depends only on the seed, the epoch and the index, so that it is the same for
-    any number of processes. Augmented scans belong to the epoch (`Dataset.at_epoch`).
+    any number of processes.
 
     Args:
-        dataset: the dataset that reads the scans.
-        records: the scans.
+        scans: the scans to train on.
         expects: what the networks expect of a scan, before its augmentation.
         augment: how the scans are augmented, or None to leave them unchanged.
         seed: the seed of the augmentation.
@@ -58,28 +57,26 @@ class ScanSet(data.Dataset[Scan]):
 
     def __init__(
         self,
-        dataset: Dataset,
-        records: Sequence[ScanRecord],
+        scans: TrainingData,
         expects: Expectation,
         augment: AugmentConfig | None = None,
         seed: int = 0,
     ) -> None:
-        self.dataset = dataset
-        self.records = list(records)
+        self.scans = scans
         self.expects = expects
         self.augment = augment
         self.seed = seed
 
-        classes = enumerate(dataset.taxonomy.classes, start=1)
+        classes = enumerate(scans.taxonomy.classes, start=1)
         self.pasted = [train_id for train_id, name in classes if name in PASTED_CLASSES]
 
     def __len__(self) -> int:
-        return len(self.records)
+        return len(self.scans)
 
     def __getitem__(self, key: Key) -> Scan:
         epoch, index = key
         if self.augment is None:
-            return self._read(self.records[index])
+            return self._read((0, index))  # what validates does not change
 
         # Keep the order of the random draws, because it decides which scan a seed gives.
         config = self.augment
@@ -101,12 +98,11 @@ class ScanSet(data.Dataset[Scan]):
     def _draw(self, key: Key, rng: np.random.Generator) -> Scan:
         """Return a scan of an epoch, augmented."""
         assert self.augment is not None
-        epoch, index = key
-        record = self.dataset.at_epoch(self.records[index], epoch)
-        return augment(self._read(record), self.augment, rng)
+        return augment(self._read(key), self.augment, rng)
 
-    def _read(self, record: ScanRecord) -> Scan:
-        scan = self.dataset.read(record)
+    def _read(self, key: Key) -> Scan:
+        epoch, index = key
+        scan = self.scans.read(index, epoch)
         if scan.labels is None:
             raise InputError(
                 f"{scan.name}: expected labels to train with, found none; name labelled sequences"

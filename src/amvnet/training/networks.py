@@ -11,8 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import NetworkTraining
-from amvnet.data.datasets.joined import Joined
-from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
 from amvnet.models.amvnet import AMVNet
@@ -20,6 +18,8 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import counted
+from amvnet.sensors.expectation import Expectation
+from amvnet.training.checking import Checked
 from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
@@ -267,11 +267,12 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tenso
     )
 
 
-def train_network(plan: Plan, name: str, weights: Weights) -> None:
+def train_network(plan: Plan, checked: Checked, name: str, weights: Weights) -> None:
     """Train a network in the stage `rv` or `bev`, and write its weights after each epoch.
 
     Args:
         plan: the plan of the run.
+        checked: what the check of the plan has found.
         name: the stage, "rv" or "bev".
         weights: the weights to begin with.
 
@@ -281,14 +282,11 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     """
     config = getattr(plan.recipe.training, name)
     model = plan.build(weights)
-    loaders = make_loaders(plan, config)
+    loaders = make_loaders(plan, config, weights.expects)
     # The class weights of the loss (section 4.2 of the paper).
-    loss_weights = None
-    if config.class_weights:
-        assert plan.class_counts is not None
-        loss_weights = class_weights(plan.class_counts)
-    stage = make_stage(plan, name, model, loss_weights)
-    for line in _notes(plan, name):
+    loss_weights = class_weights(checked.class_counts) if config.class_weights else None
+    stage = make_stage(plan, name, model, loss_weights, checked.taught)
+    for line in _notes(plan, name, checked.taught):
         plan.report(line)
     try:
         fit(stage, plan, loaders, weights)
@@ -300,24 +298,24 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
         ) from None
 
 
-def _notes(plan: Plan, name: str) -> Iterator[str]:
+def _notes(plan: Plan, name: str, taught: np.ndarray) -> Iterator[str]:
     """Yield lines about classes that a dataset lacks, and about scans that no epoch uses."""
     config = getattr(plan.recipe.training, name)
-    dataset = plan.scans.dataset
+    sources = plan.data.sources
 
     def listed(row: Any) -> str:
-        return ", ".join(dataset.taxonomy.classes[index] for index in np.flatnonzero(row))
+        return ", ".join(plan.data.taxonomy.classes[index] for index in np.flatnonzero(row))
 
-    rivals = _rivals(plan)
+    rivals = rival_classes(taught)
     kept = ", and keep the probabilities of --init there (distill)" if config.distill else ""
-    for member, row in zip(dataset.members, [] if rivals is None else ~rivals, strict=False):
+    for source, row in zip(sources, [] if rivals is None else ~rivals, strict=False):
         if row.any():
             yield (
-                f"{name}: {member.spec} has hardly a point of {listed(row)}; its scans do not "
-                f"count against these classes{kept}"
+                f"{name}: {source.dataset.spec} has hardly a point of {listed(row)}; its scans do "
+                f"not count against these classes{kept}"
             )
-    if config.distill and plan.taught is not None:
-        absent = ~plan.taught.any(axis=0)
+    if config.distill:
+        absent = ~taught.any(axis=0)
         if absent.any():
             yield (
                 f"{name}: no --data has more than stray points of {listed(absent)}; the network "
@@ -325,34 +323,29 @@ def _notes(plan: Plan, name: str) -> Iterator[str]:
                 "simulated streets"
             )
 
-    if isinstance(dataset, Joined):
-        for places, other in zip(dataset.places, dataset.others, strict=True):
-            used = places * config.epochs
-            if used < len(other.train) and not isinstance(other.dataset, SimulatedStreets):
-                yield (
-                    f"{name}: {used} of {len(other.train)} scans of {other.dataset.spec} are used "
-                    f"in {counted(config.epochs, 'epoch')}; --training.others decides how many"
-                )
-
-
-def _rivals(plan: Plan) -> np.ndarray | None:
-    """Return the `rival_classes` of the datasets, or None if all points count against all."""
-    return None if plan.taught is None else rival_classes(plan.taught)
+    for places, source in zip(plan.data.places, sources, strict=True):
+        used = places * config.epochs
+        if used < len(source.train) and not source.dataset.simulated_sensor:
+            yield (
+                f"{name}: {used} of {len(source.train)} scans of {source.dataset.spec} are used in "
+                f"{counted(config.epochs, 'epoch')}; --training.others decides how many"
+            )
 
 
 def make_stage(
-    plan: Plan, name: str, model: AMVNet, weights: np.ndarray | None
+    plan: Plan, name: str, model: AMVNet, weights: np.ndarray | None, taught: np.ndarray
 ) -> RangeStage | PolarStage:
     """Return the stage `rv` or `bev` of a model.
 
     Args:
         weights: (K,) class weights of the loss, or None for equal weights.
+        taught: (M, K) bool, whether each of the M datasets teaches each class.
     """
     config = getattr(plan.recipe.training, name)
-    rivals = _rivals(plan)
+    rivals = rival_classes(taught)
     shared: dict[str, Any] = {
         "config": config,
-        "taxonomy": plan.scans.dataset.taxonomy,
+        "taxonomy": plan.data.taxonomy,
         "weights": weights,
         "rivals": rivals,
         "processes": plan.processes,
@@ -367,19 +360,16 @@ def make_stage(
     return PolarStage(model.polar_view, net, **shared)
 
 
-def make_loaders(plan: Plan, config: NetworkTraining) -> Loaders:
+def make_loaders(plan: Plan, config: NetworkTraining, expects: Expectation) -> Loaders:
     """Return the loaders of training batches and of validation batches."""
     training = plan.recipe.training
-    scans = plan.scans
     shared: dict[str, Any] = {"workers": training.workers, "processes": plan.processes}
 
     # The number of scans that one process takes at a time.
     batch = config.batch // config.accumulate // plan.processes.size
-    assert plan.expects is not None
-    expects = plan.expects
-    train_set = ScanSet(scans.dataset, scans.train, expects, training.augment, training.seed)
+    train_set = ScanSet(plan.data, expects, training.augment, training.seed)
     train = make_loader(train_set, batch, shuffle=True, **shared)
-    if not scans.val:
+    if not plan.data.val:
         return train, None
-    val_set = ScanSet(scans.dataset, scans.val, expects)
+    val_set = ScanSet(plan.data.to_validate(), expects)
     return train, make_loader(val_set, 1, shuffle=False, **shared)

@@ -1,22 +1,19 @@
-"""The plan of a training run: what it trains, on which scans, and how it runs."""
+"""The plan of a training run: what it is asked to train, on which scans, and how."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
-
-from amvnet.config.schema import Recipe
+from amvnet.config.schema import Recipe, StageName
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.datasets.joined import join
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.datasets.own import OwnScans
-from amvnet.data.datasets.select import TrainingScans, all_to_train
+from amvnet.data.datasets.select import to_mix_in
+from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.inference.reading import normalised
@@ -34,13 +31,15 @@ MAX_MEASURED_RECORDINGS = 20  # largest number of a user's recordings that are m
 
 @dataclass(frozen=True)
 class Plan:
-    """One training run.
+    """One training run, as it is asked for. `Checked` is what its check finds.
 
     Attributes:
         recipe: what to train.
-        scans: the scans to train on and to validate with. If there are no scans to validate with,
+        data: the scans to train on and to validate with. If there are no scans to validate with,
             the last weights are kept as the best.
         out: the folder of the run.
+        init: the weights to begin with.
+        stage: the stage to train, or "all" for the stages of the recipe.
         resume: continue an earlier run in the same folder.
         report: a function that prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
@@ -51,22 +50,17 @@ class Plan:
             ignored.
         expects: what the networks expect of a scan, and the weights will say. By default, the
             training measures it on its scans before the first stage (`expected_after`).
-        class_counts: (K,) number of points of each class in the training scans of an epoch. The
-            check of the scans sets it.
-        taught: (M, K) bool, whether each of the M datasets teaches each class (`rival_classes`),
-            or None if all do. The check of the scans sets it.
-        initial: the digests of the parts of the weights to begin with, by part.
-        stages: the stages of this call in order, from which the time left is estimated; empty if
-            they are unknown.
 
     Raises:
-        InputError: if the processes cannot share the scans or the batches, or the recipe is for
-            other classes than the dataset's.
+        InputError: if the processes cannot share the scans or the batches, the recipe is for other
+            classes than the dataset's, or `scores` are for another stage than the head.
     """
 
     recipe: Recipe
-    scans: TrainingScans
+    data: TrainingData
     out: Path
+    init: Weights | None = None
+    stage: StageName | Literal["all"] = "all"
     resume: bool = False
     report: Reporter = report_nothing
     bars: bool = False
@@ -74,14 +68,14 @@ class Plan:
     scores: ScorePair | None = None
     also_read: Sequence[Path | str | None] = ()
     expects: Expectation | None = None
-    class_counts: np.ndarray | None = None
-    taught: np.ndarray | None = None
-    initial: Mapping[str, str] = field(default_factory=dict)
-    stages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.scores is not None and self.stages != ("head",):
+            raise InputError(
+                f"expected --stage head for scores of other models, found {self.stage}; add it"
+            )
         size = self.processes.size
-        val = self.scans.val
+        val = self.data.val
         if 0 < len(val) < size:  # a process without a scan would keep the others waiting
             raise InputError(
                 f"expected a validation scan for each of {size} processes, found {len(val)}; "
@@ -96,7 +90,7 @@ class Plan:
                     f"set --training.{name}.batch or --training.{name}.accumulate"
                 )
 
-        taxonomy = self.scans.dataset.taxonomy.name
+        taxonomy = self.data.taxonomy.name
         # A user's own classes fit any recipe, and any classes fit a recipe without classes.
         is_open = self.recipe.from_init or taxonomy not in TAXONOMIES
         if not is_open and taxonomy != self.recipe.taxonomy:
@@ -105,16 +99,21 @@ class Plan:
                 f"found {taxonomy}; use the recipe of that benchmark"
             )
 
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages to train, in order."""
+        return self.recipe.stages if self.stage == "all" else (self.stage,)
+
     @classmethod
     def open(
         cls,
         recipe: Recipe,
-        data: Sequence[str],
+        specs: Sequence[str],
         out: Path,
-        choose: Callable[[Dataset], TrainingScans],
+        choose: Callable[[Dataset], Source],
         init: Weights | None = None,
         *,
-        stage: str = "all",
+        stage: StageName | Literal["all"] = "all",
         report: Reporter = report_nothing,
         **settings: Any,
     ) -> Plan:
@@ -122,15 +121,12 @@ class Plan:
 
         Args:
             recipe: what to train. Sizes and classes come from `init` if the recipe says so.
-            data: the datasets, as `open_dataset` takes them. The training scans of the second and
+            specs: the datasets, as `open_dataset` takes them. The training scans of the second and
                 of later datasets are mixed in.
             out: the folder of the run.
             choose: a function that returns the scans of the first dataset to train on and to
                 validate with.
-            init: the weights to begin with.
-            stage: the stage to train, or "all" for the stages of the recipe.
-            report: a function that prints a line about what happens.
-            settings: further attributes of the plan.
+            init, stage, report, settings: attributes of the plan.
 
         Raises:
             InputError: if a dataset cannot be opened or mixed in, the recipe needs `init`, or the
@@ -140,12 +136,12 @@ class Plan:
         stages = recipe.stages if stage == "all" else (stage,)
         first, *others = [
             open_for_training(spec, recipe, out, init, stages=stages, report=report)
-            for spec in data
+            for spec in specs
         ]
         recipe = without_initial_weights(recipe, init, first.taxonomy, stages, report)
-        mixed = [all_to_train(dataset) for dataset in others]
-        scans = join(choose(first), mixed, recipe.training.others)
-        return cls(recipe, scans, out, report=report, stages=stages, **settings)
+        mixed = [to_mix_in(dataset) for dataset in others]
+        data = TrainingData([choose(first), *mixed], recipe.training.others)
+        return cls(recipe, data, out, init, stage, report=report, **settings)
 
     def build(self, weights: Weights) -> AMVNet:
         """Return a model with some weights. Parts that the weights lack are initialised at random.
@@ -232,12 +228,12 @@ def open_for_training(
     expected = expected_before(known, parts, recipe, stages)
 
     opened = normalised(open_dataset(data), Normaliser(expected, report=report))
-    if isinstance(opened, OwnScans) and isinstance(opened.normalise, Normaliser):
+    if isinstance(opened.normalise, Normaliser):
         _report_recordings(opened, opened.normalise, report)
     return opened
 
 
-def _report_recordings(dataset: OwnScans, normaliser: Normaliser, report: Reporter) -> None:
+def _report_recordings(dataset: Dataset, normaliser: Normaliser, report: Reporter) -> None:
     """Measure the first recordings, and report what is assumed of them.
 
     The processes that read them report nothing.

@@ -14,8 +14,8 @@ from typing import Any
 import yaml
 
 from amvnet.config.nested import flat, to_dict
-from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.joined import Joined
+from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.training_data import TrainingData
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, parse_yaml, remove_unfinished
 from amvnet.models.methods import BOTH_NETWORKS
@@ -79,14 +79,11 @@ def check_folder(plan: Plan) -> None:
 
 
 @contextmanager
-def alone_in_run(plan: Plan, stage: str) -> Iterator[None]:
+def alone_in_run(plan: Plan) -> Iterator[None]:
     """Keep out other calls that train the same stages, and remove what killed calls have left.
 
     Both networks may be trained at the same time, by two calls. Of the processes that share a call,
     the first one does this.
-
-    Args:
-        stage: the stage of this call, or "all".
 
     Raises:
         InputError: if another call is training one of the stages.
@@ -96,9 +93,9 @@ def alone_in_run(plan: Plan, stage: str) -> Iterator[None]:
         return
 
     with ExitStack() as locks:
-        for name in PART_OF if stage == "all" else (stage,):
+        for name in PART_OF if plan.stage == "all" else (plan.stage,):
             locks.enter_context(alone_in(plan.out, f".{name}.lock"))
-        remove_unfinished(plan.out if stage == "all" else plan.out / stage)
+        remove_unfinished(plan.out if plan.stage == "all" else plan.out / plan.stage)
         yield
 
 
@@ -116,30 +113,42 @@ def with_trained(plan: Plan, name: str, weights: Weights) -> Weights:
     return replace_part(weights, PART_OF[name], load(path))
 
 
-def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
-    """Write recipe.yaml, and the entry of this call into run.yaml.
+def with_finished(plan: Plan, weights: Weights) -> Weights:
+    """Return the weights with the parts that the finished stages of this folder have trained.
 
-    Args:
-        stage: the name of the entry: a stage, or "all".
-        init: the weights that the call begins with.
+    Another process may have finished some stages while this process trained.
     """
-    dataset = plan.scans.dataset
+    for name in stages_of_folder(plan):
+        if is_finished(plan, name):
+            weights = with_trained(plan, name, weights)
+    return weights
+
+
+def stages_of_folder(plan: Plan) -> Sequence[str]:
+    """Return the names of the stages that the folder can hold."""
+    # The networks of this folder cannot use a head that was trained on other models' scores.
+    return list(PART_OF) if plan.scores is None else ["head"]
+
+
+def write_record(plan: Plan) -> None:
+    """Write recipe.yaml, and the entry of this call into run.yaml."""
+    specs = plan.data.specs
     entry: dict[str, Any] = {
         "versions": {name: version(name) for name in PACKAGES},
         "python": platform.python_version(),
-        "data": dataset.specs if isinstance(dataset, Joined) else dataset.spec,
-        "classes": dataset.taxonomy.name,
-        "train": sequence_names(plan.scans.train),
-        "val": sequence_names(plan.scans.val),
-        "init": None if init is None else init.digests(),
+        "data": specs if len(specs) > 1 else specs[0],
+        "classes": plan.data.taxonomy.name,
+        "train": sequence_names(plan.data.train),
+        "val": sequence_names(plan.data.val),
+        "init": None if plan.init is None else plan.init.digests(),
     }
     if plan.scores is not None:
         entry["scores"] = repr(plan.scores)
 
     # Entries of earlier calls for other stages stay. The new entry comes last.
     entries = _entries(plan.out / RECORD)
-    entries.pop(stage, None)
-    entries[stage] = entry
+    entries.pop(plan.stage, None)
+    entries[plan.stage] = entry
     write_yaml(plan.out / RECORD, entries)  # first, because it marks the folder of a run
     recipe = to_dict(plan.recipe)
     if plan.recipe.from_init:
@@ -169,14 +178,15 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
     """
     recipe = to_dict(plan.recipe)
     training_keys = [name, "augment", "seed", "precision"]
-    train = plan.scans.train
-    val = plan.scans.val
+    part = PART_OF[name]
+    train = plan.data.train
+    val = plan.data.val
     settings: dict[str, Any] = {
-        "model": {key: recipe["model"][key] for key in SIZES[PART_OF[name]]},
+        "model": {key: recipe["model"][key] for key in SIZES[part]},
         "training": {key: recipe["training"][key] for key in training_keys},
         "scans": {"train": _digest_of_scans(train), "val": _digest_of_scans(val)},
-        "init": plan.initial.get(PART_OF[name]),
-        "classes": _digest_of_classes(plan.scans.dataset.members),
+        "init": plan.init.digest(part) if plan.init and part in plan.init.parts else None,
+        "classes": _digest_of_classes(plan.data),
     }
 
     if plan.scores is not None:
@@ -192,13 +202,12 @@ def stage_record(plan: Plan, settings: dict[str, Any]) -> dict[str, Any]:
     Args:
         settings: the settings of the stage, as `stage_settings` returns them.
     """
-    scans = plan.scans
     scores = {"scores": settings["scores"]} if "scores" in settings else {}
     return {
         **settings["training"],
-        "sequences": sequence_names(scans.train),
-        "validated_on": sequence_names(scans.val),
-        "scans": len(scans.train),
+        "sequences": sequence_names(plan.data.train),
+        "validated_on": sequence_names(plan.data.val),
+        "scans": len(plan.data),
         **scores,
     }
 
@@ -259,12 +268,12 @@ def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
     return sorted({record.sequence for record in records})
 
 
-def _digest_of_classes(datasets: Sequence[Dataset]) -> str:
+def _digest_of_classes(data: TrainingData) -> str:
     """Return a digest of the classes' names in order, and of their raw ids in each dataset."""
     classes = []
-    for dataset in datasets:
-        ids = sorted(dataset.taxonomy.raw_to_train.items(), key=str)
-        classes.append((dataset.taxonomy.classes, ids))
+    for source in data.sources:
+        taxonomy = source.dataset.taxonomy
+        classes.append((taxonomy.classes, sorted(taxonomy.raw_to_train.items(), key=str)))
     return hashlib.sha256(repr(classes).encode()).hexdigest()[:16]
 
 

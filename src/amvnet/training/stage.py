@@ -313,8 +313,6 @@ def _epochs_after(stage: Stage, plan: Plan) -> int:
     The epochs of the head take hardly any time. Before them, all scans are scored once for each
     view, and each scoring counts as an epoch.
     """
-    if stage.name not in plan.stages:
-        return 0
     epochs = 0
     for name in plan.stages[plan.stages.index(stage.name) + 1 :]:
         config = getattr(plan.recipe.training, name)

@@ -42,14 +42,14 @@ def ablate(
         recipe,
         [data],
         out,
-        choose=choice.scans,
+        choose=choice.source,
         report=report,
         resume=True,
         bars=on_terminal(),
         processes=processes,
     )
-    scans = plan.scans
-    report(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
+    train, val = describe_records(plan.data.train), describe_records(plan.data.val)
+    report(f"training on {train}; scoring on {val}")
 
     table = {out / f"{TABLE}.csv": charts.TABLE}
     check_outputs(table, [data], overwrite=is_begun(out))

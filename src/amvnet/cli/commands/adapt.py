@@ -57,9 +57,10 @@ def adapt(
         val_sequences: sequences or scenes of --val, separated by commas; default: all with labels.
         resume: continue an earlier run in the folder.
     """
-    from amvnet.data.datasets.joined import join
-    from amvnet.data.datasets.select import TrainingScans, all_to_train
+    from amvnet.data.datasets.base import choose_records
+    from amvnet.data.datasets.select import to_mix_in
     from amvnet.data.datasets.simulated import SimulatedStreets
+    from amvnet.data.datasets.training_data import Source, TrainingData
     from amvnet.inference.drive import find_poses
     from amvnet.inference.listing import list_inputs
     from amvnet.sensors.normalise import Normaliser
@@ -81,15 +82,14 @@ def adapt(
         return load_segmenter(chosen, "amvnet", compute)
 
     def make_plan(dataset: Dataset) -> Plan:
-        mixed = []
+        sources = [Source(dataset, choose_records(dataset, None, "all"))]
         if streets:
-            mixed = [all_to_train(SimulatedStreets(out / "streets", loaded.sensor))]
-        taught = TrainingScans(dataset, dataset.records(dataset.official("all")), [])
-        joined = join(taught, mixed, recipe.training.others)
+            sources.append(to_mix_in(SimulatedStreets(out / "streets", loaded.sensor)))
         return Plan(
             recipe,
-            joined,
+            TrainingData(sources, recipe.training.others),
             out,
+            init=loaded,
             resume=resume,
             report=report,
             bars=on_terminal(),

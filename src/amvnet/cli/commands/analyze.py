@@ -47,8 +47,9 @@ def analyze(
         overwrite: replace files that exist.
     """
     from amvnet.config.recipes import load_recipe
+    from amvnet.data.datasets.base import choose_records
     from amvnet.data.datasets.open import open_dataset
-    from amvnet.data.datasets.select import TrainingScans
+    from amvnet.data.datasets.training_data import Source, TrainingData
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
@@ -76,9 +77,9 @@ def analyze(
     check_outputs(outputs, [data, weights, recipe], overwrite)
     plan = None
     if recipe is not None:
-        names = train_sequences or dataset.sequences("train")
-        scans = TrainingScans(dataset, dataset.labelled(dataset.records(names)), records)
-        plan = Plan(load_recipe(recipe), scans, out, resume=True, report=report)
+        train = dataset.labelled(choose_records(dataset, train_sequences, "train"))
+        taught = TrainingData([Source(dataset, train, records)])
+        plan = Plan(load_recipe(recipe), taught, out, resume=True, report=report)
 
     segmenter = load_segmenter(loaded, "amvnet", compute)
     make_folder(out)

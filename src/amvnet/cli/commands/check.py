@@ -20,7 +20,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     from amvnet.data.datasets.open import open_dataset
 
     dataset = open_dataset(data)
-    splits = dict(choice.splits(dataset))
+    splits = choice.splits(dataset)
     with progress("checking") as step:
         checked = check_scans(dataset, splits, step)
 

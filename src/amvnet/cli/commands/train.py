@@ -50,7 +50,6 @@ def train(
         with_val: also train on the validation scans, and skip the validation, as for an entry to a
             benchmark.
     """
-    from amvnet.data.datasets.joined import Joined
     from amvnet.models.methods import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
     from amvnet.training.plan import Plan
@@ -58,13 +57,12 @@ def train(
     from amvnet.weights.file import load
 
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
-    weights = None if init is None else load(init)
     plan = Plan.open(
         recipe,
         data,
         out,
-        choose=lambda dataset: choice.scans(dataset, with_val),
-        init=weights,
+        choose=lambda dataset: choice.source(dataset, with_val),
+        init=None if init is None else load(init),
         stage=stage,
         report=report,
         resume=resume,
@@ -73,15 +71,12 @@ def train(
         scores=models.parse(),
         also_read=(*data, init),
     )
-    scans = plan.scans
-    if isinstance(scans.dataset, Joined):
-        for other in scans.dataset.others:
-            report_unused(other, f"{other.dataset.spec}: ")
-    report(
-        f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}"
-    )
+    for other in plan.data.sources[1:]:
+        report_unused(other, f"{other.dataset.spec}: ")
+    train, val = describe_records(plan.data.train), describe_records(plan.data.val)
+    report(f"training on {train}; validating on {val}")
 
-    path = train_stages(plan, stage, weights)
+    path = train_stages(plan)
     line = f"weights in {path}"
     parts = load(path).parts
     if stage != "head" and set(BOTH_NETWORKS) <= set(parts) and "point_head" not in parts:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.find import NamedScan
 from amvnet.data.labels.ids import check_count, read_ids, train_ids, write_ids
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
@@ -16,6 +19,9 @@ from amvnet.errors import InputError
 from amvnet.files import inside
 from amvnet.progress import counted
 from amvnet.scan import Scan
+
+# Turns the points of a file into a scan, given the name of the recording.
+Normalise = Callable[[Cloud, str], Scan]
 
 
 @dataclass(frozen=True)
@@ -49,9 +55,17 @@ class Dataset(ABC):
         root: the folder that was opened.
         taxonomy: the classes of the labels.
         spec: the text by which `open_dataset` opens the same dataset; by default the folder.
+        readers: number of threads that may read scans at the same time.
+        simulated_sensor: the sensor whose scans are simulated, new ones in each epoch; "" if the
+            scans are recorded.
+        described_sensor: what a description of the dataset says of the sensor, if anything.
+        normalise: makes scans of the points in the files; without it, points stay unchanged.
     """
 
-    readers = 8  # threads that may read scans at the same time
+    readers = 8
+    simulated_sensor = ""
+    described_sensor: str | Mapping[str, Any] | None = None
+    normalise: Normalise | None = None
 
     def __init__(self, root: Path | str, taxonomy: Taxonomy, spec: str | None = None) -> None:
         self.root = Path(root)
@@ -59,61 +73,65 @@ class Dataset(ABC):
         self.spec = spec or str(root)
 
     @abstractmethod
-    def official(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of an official split that are on disk.
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        """Return the sequences on disk of "all" and of each split that the dataset knows.
 
-        Args:
-            split: "train", "val", "test", another one that the dataset knows, or "all".
-
-        Raises:
-            InputError: if the split is unknown or none of its sequences is on disk.
+        A split may have none.
         """
 
-    @property
-    def members(self) -> Sequence[Dataset]:
-        """The datasets that this one joins; the dataset itself if it joins none."""
-        return [self]
+    def lacks(self, split: str) -> str:
+        """Return the error that says what a split without a sequence lacks."""
+        return f"{self.spec}: expected sequences of the split {split}, found none; name others"
 
     @property
     def is_split(self) -> bool:
-        """Whether there is an official split: sequences to train on and to validate with."""
-        return bool(self._on_disk("train") and self._on_disk("val"))
+        """Whether the dataset's own split has sequences to train on and to validate with."""
+        splits = self.splits()
+        return bool(splits.get("train") and splits.get("val"))
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of a split; every command uses these.
-
-        Without an official split, the last sequence validates and the others train. Sequences of
-        the test split do neither, nor do those without labels if others have labels. If only the
-        official "val" is on disk, it validates.
+        """Return the sequences of a split, for "train" and "val" as `division` returns them.
 
         Raises:
-            InputError: as `official`, also if there are fewer than two sequences to split.
+            InputError: if the split is unknown or has no sequence.
         """
-        if split not in ("train", "val") or self.is_split:
-            return self.official(split)
+        splits = self.splits()
+        if split not in splits:
+            raise InputError(
+                f"{self.spec}: expected a split of {', '.join(splits)}, found {split!r}; give one "
+                "of them"
+            )
+        names = self.division()[split] if split in ("train", "val") else splits[split]
+        if not names:
+            raise InputError(self.lacks(split))
+        return names
 
-        trainable = self.trainable()
-        val = self._on_disk("val") or trainable[-1:]
-        train = tuple(name for name in trainable if name not in val)
-        if not train or not val:
-            return self.official(split)
-        return train if split == "train" else val
+    def division(self) -> dict[str, tuple[str, ...]]:
+        """Return the sequences to train on ("train") and to validate with ("val") by default.
+
+        Without a split of its own, the last sequence of a dataset validates and the others train.
+        If only its "val" is on disk, that validates. If too few are on disk, one of both is empty.
+        """
+        splits = self.splits()
+        train, val = splits.get("train", ()), splits.get("val", ())
+        if not self.is_split:
+            trainable = self.trainable()
+            last = val or trainable[-1:]
+            others = tuple(name for name in trainable if name not in last)
+            if others:
+                return {"train": others, "val": last}
+        return {"train": train, "val": val}
 
     def trainable(self) -> tuple[str, ...]:
-        """Return the sequences to train on or to validate with, without an official split."""
-        test = self._on_disk("test")
-        names = tuple(name for name in self.official("all") if name not in test)
-        if not names:
-            return ()
-        labelled = {record.sequence for record in self.records(names) if record.has_labels}
+        """Return the sequences outside "test"; only those with labels, if any have labels."""
+        splits = self.splits()
+        names = tuple(name for name in splits["all"] if name not in splits.get("test", ()))
+        labelled = {record.sequence for record in self.having_labels(self.records(names))}
         return tuple(name for name in names if name in labelled) or names
 
-    def _on_disk(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of an official split; empty if there are none."""
-        try:
-            return self.official(split)
-        except InputError:
-            return ()
+    def left_out(self) -> list[ScanRecord]:
+        """Return the scans that the dataset's own split does not name, though it has one."""
+        return []
 
     @abstractmethod
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
@@ -133,6 +151,17 @@ class Dataset(ABC):
         Raises:
             InputError: if a file is missing, truncated, empty or does not fit its scan.
         """
+
+    def recordings(self) -> dict[str, list[NamedScan]]:
+        """Return the scans that `normalise` can change, in order, by the name of the recording.
+
+        Scans of the benchmarks stay unchanged, because weights are trained on such scans.
+        """
+        return {}
+
+    def normalised_by(self, normalise: Normalise) -> Dataset:
+        """Return the dataset with its `recordings` normalised."""
+        return self
 
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
         """Return the scan that takes a scan's place in an epoch: in most datasets, the scan."""
@@ -226,14 +255,6 @@ class Dataset(ABC):
         ids = check_count(ids, record.points_path, count)
         path = inside(folder, record.prediction)
         return write_ids(path, (taxonomy or self.taxonomy).to_raw(ids), _id_type(path))
-
-
-def check_split(source: Path | str, split: str, splits: Collection[str]) -> None:
-    """Raise an InputError if a dataset does not know a split."""
-    if split not in splits:
-        raise InputError(
-            f"{source}: expected a split of {', '.join(splits)}, found {split!r}; give one of them"
-        )
 
 
 def not_trained_on(unseen: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from amvnet.data.datasets.base import Dataset, ScanRecord, check_split, not_trained_on
+from amvnet.data.datasets.base import Dataset, ScanRecord, not_trained_on
 from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
@@ -94,46 +94,43 @@ class NuScenes(Dataset):
         first = folder.relative_to(root).parts[0]
         return NuScenes.matches(root) and (first in FOLDERS or first.startswith("v1.0-"))
 
-    def official(self, split: str) -> tuple[str, ...]:
-        """Return the scenes of a split of `SPLITS` that are on disk."""
-        scenes = self.scenes(split)
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        """Return the scenes of each split of `SPLITS` that are on disk."""
         folder = self.root / "samples" / CHANNEL
         file_names = set(os.listdir(folder)) if folder.is_dir() else set()
-
-        on_disk = []
-        for scene, records in sorted(self._records_by_scene.items()):
+        on_disk = set()
+        for scene, records in self._records_by_scene.items():
             if any(record.points_path.name in file_names for record in records):
-                on_disk.append(scene)
+                on_disk.add(scene)
 
-        present = tuple(scene for scene in on_disk if scene in scenes)
-        if not present:
-            unseen = [scene for scene in on_disk if not self._split(scene).endswith("train")]
-            advice = f"or name {not_trained_on(unseen)}" if on_disk else "which the tables list"
-            raise InputError(
-                f"{folder}: expected scans of {split} scenes "
-                f"({len(scenes)} in the tables of {self.version}), found none; "
-                f"unpack their files, {advice}"
-            )
+        splits = {}
+        for split in SPLITS:
+            splits[split] = tuple(scene for scene in self.scenes(split) if scene in on_disk)
+        return splits
 
-        return present
+    def lacks(self, split: str) -> str:
+        """Return the error that says which files to unpack, or which scenes to name instead."""
+        on_disk = self.splits()["all"]
+        unseen = [scene for scene in on_disk if not self._split(scene).endswith("train")]
+        advice = f"or name {not_trained_on(unseen)}" if on_disk else "which the tables list"
+        return (
+            f"{self.root / 'samples' / CHANNEL}: expected scans of {split} scenes "
+            f"({len(self.scenes(split))} in the tables of {self.version}), found none; "
+            f"unpack their files, {advice}"
+        )
 
     def scenes(self, split: str) -> tuple[str, ...]:
-        """Return the scenes of a split that the tables list, on disk or not.
+        """Return the scenes of a split that the tables list, on disk or not; there may be none.
 
         Args:
             split: a name in `SPLITS`. In the mini version, "train" and "val" mean "mini_train" and
                 "mini_val".
-
-        Raises:
-            InputError: if the split is unknown.
         """
-        check_split(self.root, split, SPLITS)
         scenes = []
         for scene in sorted(self._records_by_scene):
             official = self._split(scene)
             if split in ("all", official, official.removeprefix("mini_")):
                 scenes.append(scene)
-
         return tuple(scenes)
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import glob
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
+from amvnet.data.datasets.base import Dataset, Normalise, ScanRecord
 from amvnet.data.datasets.description import SPLITS, WILDCARDS, Description, read_description
-from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import ANY_FOLDERS, NamedScan, list_scans, matching, scan_stem
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError, did_you_mean, readable, reason_of, shown
 from amvnet.scan import Scan
-
-# Turns the points of a file into a scan, given the name of the recording.
-Normalise = Callable[[Cloud, str], Scan]
 
 
 class OwnScans(Dataset):
@@ -43,6 +39,7 @@ class OwnScans(Dataset):
     ) -> None:
         super().__init__(description.root, description.taxonomy, str(description.path))
         self.description = description
+        self.described_sensor = description.sensor
         self.normalise = normalise
         self._counts: dict[str, int] = {}  # points of the scans that have been read, by name
 
@@ -51,33 +48,33 @@ class OwnScans(Dataset):
         """Whether the file has a split; scans that it does not name are not chosen by default."""
         return bool(self.description.split)
 
-    def official(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of "train", "val" or "test" by the file's split, or "all"."""
-        check_split(self.spec, split, (*SPLITS, "all"))
-        names = set()
-        for record, split_of_scan in self._listing:
-            if split in ("all", split_of_scan):
-                names.add(record.sequence)
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        """Return the sequences of "train", "val" and "test" by the file's split, and of "all"."""
+        splits: dict[str, set[str]] = {name: set() for name in (*SPLITS, "all")}
+        for record, split in self._listing:
+            for name in (split, "all") if split else ("all",):
+                splits[name].add(record.sequence)
+        return {name: tuple(sorted(sequences)) for name, sequences in splits.items()}
 
-        if not names:
-            found = f"only {' and '.join(self.description.split)}"
-            if not self.is_split:
-                labelled = {record.sequence for record, _ in self._listing if record.has_labels}
-                alone = f", and labels of {min(labelled)} alone" if len(labelled) == 1 else ""
-                found = f"no split{alone}"
-            raise InputError(
-                f"{self.spec}: expected scans of the split {split}, found {found}; name them under "
-                "split, or name sequences to use"
-            )
-        return tuple(sorted(names))
+    def lacks(self, split: str) -> str:
+        """Return the error that says which splits the file has, if any."""
+        found = f"only {' and '.join(self.description.split)}"
+        if not self.is_split:
+            labelled = {record.sequence for record, _ in self._listing if record.has_labels}
+            alone = f", and labels of {min(labelled)} alone" if len(labelled) == 1 else ""
+            found = f"no split{alone}"
+        return (
+            f"{self.spec}: expected scans of the split {split}, found {found}; name them under "
+            "split, or name sequences to use"
+        )
 
     def left_out(self) -> list[ScanRecord]:
-        """Return the scans that the file's split does not name."""
+        """Return the scans that the file's split does not name, if it has one."""
         return [record for record, split in self._listing if self.is_split and not split]
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these sequences, in order."""
-        present = self.sequences("all")
+        present = self.splits()["all"]
         for name in sequences:
             if name not in present:
                 raise InputError(
@@ -149,6 +146,10 @@ class OwnScans(Dataset):
         for scan in self._scans.values():
             recordings.setdefault(scan.source, []).append(scan)
         return recordings
+
+    def normalised_by(self, normalise: Normalise) -> OwnScans:
+        """Return the same scans, normalised."""
+        return OwnScans(self.description, normalise)
 
     def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
         """Return the same scans with other classes for predictions; labels are not read."""
@@ -315,5 +316,5 @@ def open_own(path: Path | str) -> OwnScans:
         InputError: as `read_description`, or if there is no scan.
     """
     dataset = OwnScans(read_description(path))
-    dataset.sequences("all")
+    dataset.splits()
     return dataset

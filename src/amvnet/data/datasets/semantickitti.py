@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord, check_split, not_trained_on
+from amvnet.data.datasets.base import Dataset, ScanRecord, not_trained_on
 from amvnet.data.formats.cloud import check_usable
 from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import check_bits, read_ids, train_ids
@@ -49,21 +49,23 @@ class SemanticKitti(Dataset):
         # `root` may be the folder of the sequences.
         return (root / first / "velodyne").is_dir() and rest in ([], ["velodyne"], ["labels"])
 
-    def official(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of "train", "val", "test" or "all" that are on disk."""
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        """Return the sequences of "train", "val", "test" and "all" that are on disk."""
         present = self._sequences_on_disk()
-        splits = {**self.taxonomy.splits, "all": present}
-        check_split(self.root, split, splits)
-        sequences = tuple(sequence for sequence in splits[split] if sequence in present)
-        if not sequences:
-            unseen = [name for name in present if name not in splits["train"]]
-            raise InputError(
-                f"{self.root}: expected a sequence of the {split} split "
-                f"({', '.join(splits[split])}), found {', '.join(present)}; "
-                f"add one, or name {not_trained_on(unseen)}"
-            )
+        splits = {}
+        for split, names in self.taxonomy.splits.items():
+            splits[split] = tuple(name for name in names if name in present)
+        return {**splits, "all": present}
 
-        return sequences
+    def lacks(self, split: str) -> str:
+        """Return the error that names the sequences of a split, and those on disk."""
+        present = self._sequences_on_disk()
+        unseen = [name for name in present if name not in self.taxonomy.splits["train"]]
+        return (
+            f"{self.root}: expected a sequence of the {split} split "
+            f"({', '.join(self.taxonomy.splits.get(split, ()))}), found {', '.join(present)}; "
+            f"add one, or name {not_trained_on(unseen)}"
+        )
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these sequences, in order."""

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
+from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError, one_line_errors, shown
@@ -62,15 +62,13 @@ class SimulatedStreets(Dataset):
 
     def __init__(self, root: Path | str, sensor: str = "hdl64e") -> None:
         super().__init__(root, CLASSES_BY_SENSOR[sensor], f"simulated-{sensor}:{root}")
-        self.sensor = sensor
+        self.simulated_sensor = sensor
 
-    def official(self, split: str) -> tuple[str, ...]:
-        """Return the streets of "train", "val" or "all"."""
-        train = range(TRAIN_STREETS[self.sensor])
-        val = range(FIRST_VAL_STREET, FIRST_VAL_STREET + VAL_STREETS)
-        splits = {"train": [*train], "val": [*val], "all": [*train, *val]}
-        check_split(self.spec, split, splits)
-        return tuple(map(_name, splits[split]))
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        """Return the streets of "train", "val" and "all"."""
+        train = tuple(map(_name, range(TRAIN_STREETS[self.simulated_sensor])))
+        val = tuple(map(_name, range(FIRST_VAL_STREET, FIRST_VAL_STREET + VAL_STREETS)))
+        return {"train": train, "val": val, "all": (*train, *val)}
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these streets, in order."""
@@ -123,7 +121,7 @@ class SimulatedStreets(Dataset):
 
     @property
     def _is_nuscenes(self) -> bool:
-        return CLASSES_BY_SENSOR[self.sensor] is NUSCENES
+        return CLASSES_BY_SENSOR[self.simulated_sensor] is NUSCENES
 
     def _number(self, sequence: str) -> int:
         if not re.fullmatch("[0-9]{1,9}", sequence) or int(sequence) > LAST_STREET:
@@ -136,7 +134,7 @@ class SimulatedStreets(Dataset):
     def _record(self, number: int, index: int) -> ScanRecord:
         sequence = _name(number)
         scan = _name(index)
-        folder = self.root / f"streets-{self.sensor}-{_simulator()}" / sequence / scan
+        folder = self.root / f"streets-{self.simulated_sensor}-{_simulator()}" / sequence / scan
 
         return ScanRecord(
             name=f"{sequence}/{scan}",
@@ -176,7 +174,7 @@ class SimulatedStreets(Dataset):
         """Yield the scans of a street, equal to the scans that `amvnet simulate` writes."""
         seed = np.random.SeedSequence((SEED, number))
         with one_line_errors(str, only=(SimulationError,)):
-            for scan in drive_street(self.sensor, SCANS, seed):
+            for scan in drive_street(self.simulated_sensor, SCANS, seed):
                 if self._is_nuscenes:
                     indices, categories = scan.nuscenes_categories()
                     train_ids = [NUSCENES.raw_to_train[category] for category in categories]

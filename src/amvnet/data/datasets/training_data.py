@@ -1,0 +1,205 @@
+"""The datasets of a training: the first also validates, the others are mixed in."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.simulated import SCANS
+from amvnet.data.formats.find import scan_stem
+from amvnet.data.taxonomy import Taxonomy, describe_difference
+from amvnet.errors import InputError
+from amvnet.scan import Scan
+
+SEED = 16  # seed of the order in which the scans of a mixed dataset take their turns
+# Number of successive scans that take their turns together. A simulated street is simulated whole,
+# so all its scans take their turns together. Blocks at random show several places of a drive.
+BLOCK = SCANS
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset of a training, with its scans to train on and to validate with.
+
+    Attributes:
+        unlabelled: chosen scans without labels, which are skipped.
+
+    Raises:
+        InputError: if a scan is in both `train` and `val`.
+    """
+
+    dataset: Dataset
+    train: Sequence[ScanRecord]
+    val: Sequence[ScanRecord] = ()
+    unlabelled: Sequence[ScanRecord] = ()
+
+    def __post_init__(self) -> None:
+        names = {record.name for record in self.train}
+        common = names & {record.name for record in self.val}
+        if common:
+            raise InputError(
+                "expected different scans to train on and to validate with, "
+                f"found {min(common)} in both; name other sequences"
+            )
+
+    @classmethod
+    def labelled(cls, dataset: Dataset, train: Sequence[str], val: Sequence[str] = ()) -> Source:
+        """Return the labelled scans of some sequences.
+
+        Raises:
+            InputError: if a sequence does not exist or is in both, or no scan has labels.
+        """
+        chosen, chosen_val = dataset.records(train), dataset.records(val)
+        labelled, labelled_val = (
+            dataset.labelled(chosen),
+            dataset.labelled(chosen_val) if val else [],
+        )
+        used = {record.name for record in (*labelled, *labelled_val)}
+        unlabelled = [record for record in (*chosen, *chosen_val) if record.name not in used]
+        return cls(dataset, labelled, labelled_val, unlabelled)
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """The sources of a training, and the order in which it reads their scans.
+
+    An epoch has a place for each scan of the first source, then the places of the others. A source
+    with fewer places in an epoch than scans shows other scans in the next epoch. In the end it has
+    shown all equally often.
+
+    Attributes:
+        sources: the first source, which validates, and those that are mixed in.
+        share: the share of an epoch's scans that the others have in equal parts, in [0, 1). With 0,
+            each of their scans is in each epoch once.
+
+    Raises:
+        InputError: if a dataset has other classes, or scans to train on that the first one
+            validates or tests with, or the share leaves nothing for the first one.
+    """
+
+    sources: Sequence[Source]
+    share: float = 0.0
+
+    def __post_init__(self) -> None:
+        first, *others = self.sources
+        if others and self.share >= 1:
+            raise InputError(
+                "training.others: expected a share below 1, to leave some for the first --data, "
+                f"found {self.share:g}; lower it"
+            )
+        apart: set[tuple[str, str]] = set()
+        if others:
+            test = first.dataset.records(first.dataset.splits().get("test", ()))
+            apart = {_identity(record) for record in (*first.val, *test)}
+        for other in others:
+            for record in other.train:
+                if _identity(record) in apart:
+                    raise InputError(
+                        "expected scans to train on apart from those to validate or to test with, "
+                        f"found {record.points_path} among both; leave it out of "
+                        f"{other.dataset.spec}"
+                    )
+            classes = other.dataset.taxonomy.classes
+            if classes != self.taxonomy.classes:
+                difference = describe_difference(self.taxonomy.classes, classes, other.dataset.spec)
+                raise InputError(
+                    f"expected the same classes in every --data, found {difference}; leave out "
+                    "that --data"
+                )
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        """The classes of all sources."""
+        return self.sources[0].dataset.taxonomy
+
+    @property
+    def val(self) -> Sequence[ScanRecord]:
+        """The scans to validate with."""
+        return self.sources[0].val
+
+    @property
+    def specs(self) -> list[str]:
+        """The texts by which `open_dataset` opens the datasets; a share follows an @."""
+        first, *others = (source.dataset.spec for source in self.sources)
+        suffix = f"@{self.share / len(others):g}" if others and self.share else ""
+        return [first, *(other + suffix for other in others)]
+
+    def to_validate(self) -> TrainingData:
+        """Return the scans to validate with in the place of those to train on."""
+        return TrainingData([Source(self.sources[0].dataset, self.val)])
+
+    @cached_property
+    def places(self) -> list[int]:
+        """The number of places that each source has in an epoch."""
+        first, *others = (len(source.train) for source in self.sources)
+        if others and self.share:
+            epoch = first / (1 - self.share)
+            others = [max(round(self.share / len(others) * epoch), 1)] * len(others)
+        return [first, *others]
+
+    @cached_property
+    def train(self) -> list[ScanRecord]:
+        """The scans of the first epoch, under the names that they have in the files of a run.
+
+        A name begins with the numbers of the source and of the place, if it is not of the first
+        source: "2.0/00/000012" of the sequence "2/00".
+        """
+        records = []
+        for number in range(len(self.sources)):
+            for place, record in enumerate(self.in_epoch(number)):
+                if number > 0:
+                    name = f"{number + 1}.{place}/{record.name}"
+                    sequence = f"{number + 1}/{record.sequence}"
+                    record = dataclasses.replace(record, name=name, sequence=sequence)
+                records.append(record)
+        return records
+
+    def in_epoch(self, number: int, epoch: int = 0) -> list[ScanRecord]:
+        """Return the scans of a source in an epoch, in the order of their places."""
+        return [self._turn(number, place, epoch) for place in range(self.places[number])]
+
+    def __len__(self) -> int:
+        """Return the number of places in an epoch."""
+        return sum(self.places)
+
+    def read(self, index: int, epoch: int = 0, labels: bool = True) -> Scan:
+        """Read the scan that has a place in an epoch; its points know the number of their source.
+
+        Raises:
+            InputError: if it cannot be read (`Dataset.read`).
+        """
+        number = 0
+        while index >= self.places[number]:
+            index -= self.places[number]
+            number += 1
+        scan = self.sources[number].dataset.read(self._turn(number, index, epoch), labels)
+        return dataclasses.replace(scan, source=np.full(len(scan), number))
+
+    def _turn(self, number: int, place: int, epoch: int) -> ScanRecord:
+        """Return the scan of a source whose turn it is at a place in an epoch."""
+        source = self.sources[number]
+        turn = (epoch * self.places[number] + place) % len(source.train)
+        if number > 0:
+            turn = _order(number, len(source.train))[turn]
+        return source.dataset.at_epoch(source.train[turn], epoch)
+
+
+def _identity(record: ScanRecord) -> tuple[str, str]:
+    """Return what identifies a scan in any dataset: its file, and its name in a bag."""
+    in_file = record.name.partition(f"{scan_stem(record.points_path)}/")[2]
+    return os.path.realpath(record.points_path), in_file
+
+
+@cache
+def _order(member: int, count: int) -> np.ndarray:
+    """Return the (count,) indices of the scans of a dataset in the order of their turns."""
+    blocks = np.random.default_rng([SEED, member]).permutation(math.ceil(count / BLOCK))
+    indices = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+    return indices[indices < count]
