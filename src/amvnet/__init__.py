@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from amvnet import weights as weights
     from amvnet.data.datasets.simulated import simulate as simulate
     from amvnet.engines.base import Engine
+    from amvnet.engines.compute import EngineName, Precision
     from amvnet.errors import InputError as InputError
     from amvnet.inference.drive import drive as drive
     from amvnet.inference.fuse import fuse as fuse
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from amvnet.inference.listing import read_all as read_all
     from amvnet.inference.segmentation import Segmentation as Segmentation
     from amvnet.inference.segmenter import Segmenter as Segmenter
-    from amvnet.models.methods import EngineName, MethodName, Precision
+    from amvnet.models.methods import MethodName
     from amvnet.scan import Scan as Scan
     from amvnet.viewing.page import show as show
     from amvnet.weights.file import Weights as Weights

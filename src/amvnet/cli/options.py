@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import report, silence
 from amvnet.config.bounds import Share
+from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.models.methods import Compute, MethodName
+from amvnet.models.methods import MethodName
 from amvnet.progress import counted
 
 if TYPE_CHECKING:

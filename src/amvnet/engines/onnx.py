@@ -13,10 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.engines.base import Engine, WithUnet, build_model
+from amvnet.engines.compute import EngineName, Precision
 from amvnet.engines.precision import check_device, choose_device, choose_precision
 from amvnet.engines.streams import side_by_side
 from amvnet.errors import InputError
-from amvnet.models.methods import METHODS, EngineName, MethodName, Precision
+from amvnet.models.methods import METHODS, MethodName
 from amvnet.models.polar_net import PolarNet
 from amvnet.weights.file import Weights
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from amvnet.engines.compute import ONNX_ENGINES, PRECISIONS, Precision
 from amvnet.errors import InputError
-from amvnet.models.methods import ONNX_ENGINES, PRECISIONS, Precision
 
 
 class InPrecision(nn.Module):

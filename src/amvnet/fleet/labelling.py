@@ -24,10 +24,12 @@ from amvnet.data.formats.detect import BAGS, FOLDER, ending_of
 from amvnet.data.formats.find import NamedScan
 from amvnet.data.formats.registry import read_file
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError, without_secrets
+from amvnet.engines.compute import Compute
+from amvnet.errors import InputError
 from amvnet.files import temporary_folder
 from amvnet.fleet.manifest import check_outside, split_name
 from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, results_schema
+from amvnet.fleet.secrets import without_secrets
 from amvnet.fleet.storage import Place
 from amvnet.inference.listing import FileReader, FileScan, Outcome
 from amvnet.inference.pipeline import Pipeline
@@ -35,7 +37,6 @@ from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation, uncertain_share
-from amvnet.models.methods import Compute
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.normalise import Normaliser

@@ -12,15 +12,10 @@ from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.engines.compute import EngineName, Precision
 from amvnet.inference.pipeline import UNCERTAIN_ENDING, OutputOptions
 from amvnet.models.assertion import Disagreement
-from amvnet.models.methods import (
-    EngineName,
-    MethodName,
-    Precision,
-    check_method,
-    check_two_networks,
-)
+from amvnet.models.methods import MethodName, check_method, check_two_networks
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import DriveOptions, LabelChoice, ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Count
+from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.models.methods import Compute
 from amvnet.progress import counted
 
 if TYPE_CHECKING:

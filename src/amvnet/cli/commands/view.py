@@ -7,8 +7,9 @@ from typing import Literal
 
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
+from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.models.methods import Compute, widest_method
+from amvnet.models.methods import widest_method
 from amvnet.progress import counted
 
 
