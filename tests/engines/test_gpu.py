@@ -21,7 +21,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import amvnet
 from amvnet import Scan, Segmenter, load, simulate
 from amvnet import read as read_scan
-from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.compute import Precision
 from amvnet.engines.precision import InPrecision, choose_device, choose_precision
 from amvnet.engines.streams import TwoStreams
@@ -558,7 +557,6 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
         scans,
         segment_by(Segmenter(weights, engine)),
         OutputOptions(tmp_path),
-        SEMANTICKITTI,
         batch=4,
     )
     results = list(pipeline.stream(scans, pipeline.write_or_explain))

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from amvnet import load
+from amvnet import load_with
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import BAGS, FOLDER, ending_of
 from amvnet.data.formats.find import NamedScan
@@ -73,16 +74,8 @@ class LabelScans:
     ) -> None:
         self.request = request
         self.batch = batch
-        self._segmenter = load(
-            request.weights,
-            compute.device,
-            request.method,
-            request.precision,
-            request.engine,
-            tau=request.tau,
-        )
-        if compute.at_once is not None:
-            self._segmenter.at_once = compute.at_once
+        compute = replace(compute, engine=request.engine, precision=request.precision)
+        self._segmenter = load_with(compute, request.weights, request.method, request.tau)
         if self._segmenter.device == "cpu":
             keep_freed_memory()
         self._schema = results_schema(request.taxonomy).append(IS_FATAL)
@@ -134,7 +127,6 @@ class LabelScans:
                 scans,
                 segment_by(self._segmenter, request.classes),
                 request.output(self._out.local or folder),
-                request.taxonomy,
                 batch=self.batch,
                 at_once=self._segmenter.at_once,
             )
@@ -238,7 +230,7 @@ def _fetch(
             read = partial(_read_fetched, pool.submit(place.fetch, folder), request)
             scan = NamedScan(row["name"], row["drive"], path, ending="", read=read)
             reader.expect(scan)
-            scans.append(FileScan(scan, reader))
+            scans.append(FileScan(scan, reader, request.taxonomy))
         yield scans, temporary / "labels"
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.drive import DriveChoice, Drives, find_poses, key_of
 from amvnet.inference.journal import Entry, describe_other_run
-from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
+from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import Pipeline, Segment, check_faults, check_output
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
@@ -48,7 +48,8 @@ def predict(
 
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
-        request: how the scans are labelled, and which files are written for each.
+        request: how the scans are labelled, and which files are written for each; its precision is
+            not "auto", so that the journal says what the labels depend on.
         make_segmenter: returns the segmenter that computes the labels, with the weights, method and
             tau of the request. It is called after the inputs and the output are checked, because it
             may take long.
@@ -76,17 +77,10 @@ def predict(
     classes = request.classes
     normaliser = Normaliser(request.weights.expects, request.sensor, report)
     options = ScanOptions(sequences, split, request.topic, request.layout)
-    scans, taxonomy = list_inputs(inputs, options, request.weights.taxonomy, normaliser)
-    if classes is not None:
-        for scan in scans:
-            if isinstance(scan, DatasetScan):
-                scan.written = classes.target
-        taxonomy = classes.target
-
-    output = request.output(folder, overwrite=overwrite, resume=resume)
-    output = replace(output, also_read=also_read)
-    if not resume:  # the files of the earlier run are known only with the precision
-        check_output(scans, output)
+    written = None if classes is None else classes.target
+    scans, _ = list_inputs(inputs, options, request.weights.taxonomy, normaliser, written)
+    output = request.output(folder, overwrite=overwrite, resume=resume, also_read=also_read)
+    check_output(scans, output)
     drives = None
     if drive is not None:
         drives = find_poses(scans, drive.poses, drive.past_only, report=report)
@@ -94,15 +88,12 @@ def predict(
         drives = replace(drives, table=table)
         request = replace(request, drive=drives.digest)
     segmenter = make_segmenter()
-    request = replace(request, precision=segmenter.engine.precision)  # not "auto"
     pipeline = Pipeline(
         scans,
         segment_by(segmenter, classes, drives),
         output,
-        taxonomy,
         batch=batch,
         at_once=segmenter.at_once,
-        is_checked=not resume,
         drives=drives,
     )
     if not resume:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -106,7 +107,13 @@ class LabellingRequest(Checked):
             "drive": self.drive,
         }
 
-    def output(self, folder: Path, overwrite: bool = False, resume: bool = False) -> OutputOptions:
+    def output(
+        self,
+        folder: Path,
+        overwrite: bool = False,
+        resume: bool = False,
+        also_read: Sequence[Path | str | None] = (),
+    ) -> OutputOptions:
         """Return which files are written for each scan, and into which folder."""
         return OutputOptions(
             folder,
@@ -115,4 +122,5 @@ class LabellingRequest(Checked):
             uncertain=self.uncertain,
             overwrite=overwrite,
             resume=resume,
+            also_read=also_read,
         )

@@ -33,17 +33,17 @@ class Segmenter:
     Args:
         weights: trained weights.
         engine: scores points by the networks of these weights.
-
-    Attributes:
-        weights, engine: as given.
         at_once: the number of scans to segment at the same time, each with its share of torch's
             threads; by default the number that the engine suggests.
+
+    Attributes:
+        weights, engine, at_once: as above.
     """
 
-    def __init__(self, weights: Weights, engine: Engine) -> None:
+    def __init__(self, weights: Weights, engine: Engine, at_once: int | None = None) -> None:
         self.weights = weights
         self.engine = engine
-        self.at_once = engine.at_once
+        self.at_once = engine.at_once if at_once is None else at_once
 
     @property
     def taxonomy(self) -> Taxonomy:

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import stream_scans
@@ -79,7 +78,6 @@ def check_labels(labels: Path, count: int) -> None:
 
 def show_scans(
     scans: Sequence[InputScan],
-    taxonomy: Taxonomy,
     segmenter: Segmenter | None = None,
     labels: Path | None = None,
     progress: Progress = no_progress,
@@ -88,7 +86,6 @@ def show_scans(
 
     Args:
         scans: the scans.
-        taxonomy: the classes of the labels.
         segmenter: labels the scans; the labels of its networks are shown with its own.
         labels: without a segmenter, a folder of predictions as `predict` writes them, or the label
             file of a single scan.
@@ -112,7 +109,7 @@ def show_scans(
         if labels is None:
             return shown
 
-        ids = scan_input.read_labels(labels, len(scan), taxonomy)
+        ids = scan_input.read_labels(labels, len(scan))
         return replace(shown, labels={"labels": ids})
 
     at_once = 1 if segmenter is None else segmenter.at_once

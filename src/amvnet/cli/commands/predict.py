@@ -46,12 +46,14 @@ def predict(
             only scans that are new or were not finished.
         overwrite: replace files that exist.
     """
+    from amvnet.engines.precision import resolved
     from amvnet.inference.predict import predict as predict_inputs
     from amvnet.weights.file import load
 
     for text in (*inputs, out):
         if "://" in text:
             raise InputError(f"{text}: expected a path, found a URL; use amvnet fleet")
+    compute = resolved(compute)  # the labels depend on what "auto" is
     request = labels.parse(load(weights), choice, sensor_choice, compute)
 
     def make_segmenter() -> Segmenter:

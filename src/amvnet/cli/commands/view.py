@@ -82,7 +82,7 @@ def view(
         segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
     chosen = evenly_spaced(listed, scans)
     with place_for_page(html) as page, progress("looking") as step:
-        shown = show_scans(chosen, classes, segmenter, labels, progress=step)
+        shown = show_scans(chosen, segmenter, labels, progress=step)
         write_page(page, shown, classes, _title(inputs, weights))
     report(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")
     if html is None:
