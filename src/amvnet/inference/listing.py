@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -330,9 +330,7 @@ def list_inputs(
         named_scans = list(list_scans(spec, options.topic, options.layout, is_alone))
         is_nuscenes = named_scans[0].ending == NUSCENES_ENDING
         taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
-        for scan in named_scans:
-            reader.expect(scan)
-            scans.append(FileScan(scan, reader, written or taxonomies[-1]))
+        scans += announced(named_scans, reader, written or taxonomies[-1])
 
     if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
         raise InputError(
@@ -340,6 +338,15 @@ def list_inputs(
             "take them one after the other"
         )
     return scans, taxonomies[0]
+
+
+def announced(scans: Iterable[NamedScan], reader: FileReader, taxonomy: Taxonomy) -> list[FileScan]:
+    """Return scans in files that a reader can expect from now on; the rest is as for `FileScan`."""
+    found = []
+    for scan in scans:
+        reader.expect(scan)
+        found.append(FileScan(scan, reader, taxonomy))
+    return found
 
 
 class Scans(Sequence[Scan]):

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.drive import DriveChoice, Drives, find_poses, key_of
 from amvnet.inference.journal import Entry, describe_other_run
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import Pipeline, Segment, check_faults, check_output
+from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_faults, check_output
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
@@ -32,15 +31,11 @@ def predict(
     inputs: Sequence[str],
     request: LabellingRequest,
     make_segmenter: Callable[[], Segmenter],
-    folder: Path,
+    output: OutputOptions,
+    options: ScanOptions,
     *,
-    sequences: Sequence[str] | None = None,
-    split: str = "all",
     drive: DriveChoice | None = None,
     batch: int = 1,
-    overwrite: bool = False,
-    resume: bool = False,
-    also_read: Sequence[Path | str | None] = (),
     progress: Progress = no_progress,
     report: Reporter = report_nothing,
 ) -> int:
@@ -53,14 +48,11 @@ def predict(
         make_segmenter: returns the segmenter that computes the labels, with the weights, method and
             tau of the request. It is called after the inputs and the output are checked, because it
             may take long.
-        folder: the folder for the files.
-        sequences, split: which scans of datasets to use, as `ScanOptions` takes them.
+        output: the files of the request, and the folder for them.
+        options: which scans of the inputs to use.
         drive: how the scores of drives are fused over time; by default, each scan is segmented
             alone.
         batch: the number of scans that go through the networks together.
-        overwrite: replace files that exist.
-        resume: leave out the scans that an earlier run with an equal request has done.
-        also_read: other files that the command reads, which must not be replaced.
         progress: called with the number of scans that are done, and their total.
         report: takes lines about what was assumed of the sensor; at the end, if there are two
             networks, takes a line about how sure the labels are.
@@ -76,10 +68,8 @@ def predict(
     """
     classes = request.classes
     normaliser = Normaliser(request.weights.expects, request.sensor, report)
-    options = ScanOptions(sequences, split, request.topic, request.layout)
     written = None if classes is None else classes.target
     scans, _ = list_inputs(inputs, options, request.weights.taxonomy, normaliser, written)
-    output = request.output(folder, overwrite=overwrite, resume=resume, also_read=also_read)
     check_output(scans, output)
     drives = None
     if drive is not None:
@@ -96,9 +86,9 @@ def predict(
         at_once=segmenter.at_once,
         drives=drives,
     )
-    if not resume:
+    if not output.resume:
         names = {str(scan.scores_path) for scan in scans}
-        other_run = describe_other_run(folder, request.settings, names)
+        other_run = describe_other_run(output.folder, request.settings, names)
         if other_run:
             report(f"warning: {other_run}")
     entries, faults = pipeline.run(request.settings, progress)

@@ -55,6 +55,7 @@ def predict(
             raise InputError(f"{text}: expected a path, found a URL; use amvnet fleet")
     compute = resolved(compute)  # the labels depend on what "auto" is
     request = labels.parse(load(weights), choice, sensor_choice, compute)
+    also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, time.poses)
 
     def make_segmenter() -> Segmenter:
         return load_segmenter(request.weights, request.method, compute, request.tau)
@@ -64,14 +65,10 @@ def predict(
             inputs,
             request,
             make_segmenter,
-            Path(out),
-            sequences=choice.sequences,
-            split=choice.split,
+            request.output(Path(out), overwrite, resume, also_read),
+            choice.parse(),
             drive=time.parse(),
             batch=batch,
-            overwrite=overwrite,
-            resume=resume,
-            also_read=(*inputs, weights, labels.classes, sensor_choice.sensor, time.poses),
             progress=step,
             report=report,
         )
