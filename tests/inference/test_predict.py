@@ -16,6 +16,7 @@ import pytest
 import torch
 
 import amvnet
+from amvnet.cli.options import load_segmenter
 from amvnet.data.datasets.open import open_dataset
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
@@ -26,6 +27,7 @@ from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation
+from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
@@ -222,13 +224,19 @@ def test_a_killed_run_goes_on_where_it_stopped(
 
 
 @pytest.mark.parametrize("options", with_full(["", "--overwrite", "--resume"], ["--overwrite"]))
-def test_the_output_of_a_run_is_checked_once(
+def test_the_output_of_a_run_is_checked_once_before_the_networks_are_loaded(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str
 ) -> None:
-    checked: list[object] = []
-    monkeypatch.setattr("amvnet.inference.pipeline.check_outputs", lambda *_: checked.append(None))
+    steps: list[str] = []
+
+    def load(*arguments: Any) -> Segmenter:
+        steps.append("load")
+        return load_segmenter(*arguments)
+
+    monkeypatch.setattr("amvnet.inference.pipeline.check_outputs", lambda *_: steps.append("check"))
+    monkeypatch.setattr("amvnet.cli.commands.predict.load_segmenter", load)
     succeed(predict(world, tmp_path, options))
-    assert len(checked) == 1
+    assert steps == ["check", "load"]
 
 
 def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_path: Path) -> None:
