@@ -228,10 +228,8 @@ def _fetch(
             place = Place.of(row["path"])
             path = place.local or folder / Path(place.path).name
             read = partial(_read_fetched, pool.submit(place.fetch, folder), request)
-            scan = NamedScan(row["name"], row["drive"], path, ending="", read=read)
-            reader.expect(scan)
-            scans.append(FileScan(scan, reader, request.taxonomy))
-        yield scans, temporary / "labels"
+            scans.append(NamedScan(row["name"], row["drive"], path, ending="", read=read))
+        yield reader.scans(scans, request.taxonomy), temporary / "labels"
 
 
 def _read_fetched(fetching: Future[Path], request: LabellingRequest) -> Cloud:

@@ -206,10 +206,14 @@ class FileReader:
         self.is_normalising = normaliser is not None and normaliser.expected is not None
         self._clouds: dict[tuple[str, str], Cloud] = {}  # by source and name; all of one source
 
-    def expect(self, scan: NamedScan) -> None:
-        """Announce a scan; announce the scans of a source in their order."""
-        if self.normaliser is not None:
-            self.normaliser.expect(scan.source, partial(self._read_and_keep, scan))
+    def scans(self, scans: Iterable[NamedScan], taxonomy: Taxonomy) -> list[FileScan]:
+        """Return scans that this reader reads, those of a source in their order."""
+        found = []
+        for scan in scans:
+            if self.normaliser is not None:
+                self.normaliser.expect(scan.source, partial(self._read_and_keep, scan))
+            found.append(FileScan(scan, self, taxonomy))
+        return found
 
     def read(self, scan: NamedScan) -> LoadedScan:
         """Read a scan; raise InputError if it cannot be read, or no point is usable."""
@@ -330,7 +334,7 @@ def list_inputs(
         named_scans = list(list_scans(spec, options.topic, options.layout, is_alone))
         is_nuscenes = named_scans[0].ending == NUSCENES_ENDING
         taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
-        scans += announced(named_scans, reader, written or taxonomies[-1])
+        scans += reader.scans(named_scans, written or taxonomies[-1])
 
     if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
         raise InputError(
@@ -338,15 +342,6 @@ def list_inputs(
             "take them one after the other"
         )
     return scans, taxonomies[0]
-
-
-def announced(scans: Iterable[NamedScan], reader: FileReader, taxonomy: Taxonomy) -> list[FileScan]:
-    """Return scans in files that a reader can expect from now on; the rest is as for `FileScan`."""
-    found = []
-    for scan in scans:
-        reader.expect(scan)
-        found.append(FileScan(scan, reader, taxonomy))
-    return found
 
 
 class Scans(Sequence[Scan]):

@@ -21,7 +21,6 @@ from amvnet.data.labels.writers import (
     SCORES,
     SIGNATURES,
     UNCERTAIN,
-    check_kind,
     write_uncertain,
 )
 from amvnet.errors import InputError, SomeBroken, memory_for
@@ -55,9 +54,6 @@ class OutputOptions:
         resume: leave out the scans that an earlier run into the same folder has done.
         also_read: other files that the command reads, which must not be replaced; what names no
             file is ignored.
-
-    Raises:
-        InputError: if the format is unknown.
     """
 
     folder: Path
@@ -67,9 +63,6 @@ class OutputOptions:
     overwrite: bool = False
     resume: bool = False
     also_read: Sequence[Path | str | None] = ()
-
-    def __post_init__(self) -> None:
-        check_kind(self.kind)
 
     def files_of(self, scan: InputScan) -> dict[Path, Signature]:
         """Return the files that are written for a scan, by the path relative to the folder."""

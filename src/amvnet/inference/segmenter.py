@@ -12,7 +12,7 @@ from amvnet.data.formats.rows import parse_layout
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
-from amvnet.inference.listing import FileReader, InputScan, ScanOptions, announced, list_inputs
+from amvnet.inference.listing import FileReader, InputScan, ScanOptions, list_inputs
 from amvnet.inference.reading import checked_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
@@ -115,7 +115,7 @@ class Segmenter:
 
         normaliser, assumed = self._normaliser()
         named = list_scans(points, layout=parse_layout(columns))
-        scans = announced(named, FileReader(normaliser), self.taxonomy)
+        scans = FileReader(normaliser).scans(named, self.taxonomy)
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
