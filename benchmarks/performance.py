@@ -31,10 +31,10 @@ import amvnet.models.polar_net
 import amvnet.models.range_net
 from amvnet import read as read_scan
 from amvnet.data.labels.ids import write_ids
+from amvnet.engines.compute import ONNX_ENGINES
 from amvnet.engines.onnx import OnnxGraph
 from amvnet.inference.timing import FUSION, MEAN, STAGES, run_once
 from amvnet.models.layers import upsample
-from amvnet.models.methods import ONNX_ENGINES
 from amvnet.models.point_head import PointHead, head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.polar_view import PolarGrid

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-from amvnet.engines import onnx as onnx_engine
 from amvnet.engines import precision
 from amvnet.engines import torch as torch_engine
 from amvnet.export import onnx as onnx_export
@@ -50,7 +49,7 @@ def on_cpu() -> Iterator[None]:
         return choose("cpu" if name == "auto" else name, engine)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (precision, torch_engine, onnx_engine):
+        for module in (precision, torch_engine):
             patch.setattr(module, "choose_device", choose_cpu)
         yield
 

@@ -29,7 +29,7 @@ from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.listing import DatasetScan, FileReader, FileScan, InputScan
-from amvnet.inference.pipeline import OutputOptions, Pipeline
+from amvnet.inference.pipeline import OutputOptions, Pipeline, check_output
 from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
 from amvnet.weights.file import save
@@ -57,7 +57,8 @@ def label(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentati
 def write(base: Path, scans: Sequence[InputScan], kind: str = "label") -> None:
     """Write labels, scores and uncertain points of scans, as predict and fuse do."""
     output = OutputOptions(base / "out", kind, scores=True, uncertain=True, overwrite=True)
-    Pipeline(scans, label, output, NUSCENES).run({})
+    check_output(scans, output)
+    Pipeline(scans, label, output).run({})
 
 
 def some_cloud() -> Cloud:
@@ -68,7 +69,9 @@ def some_cloud() -> Cloud:
 def named(name: str) -> InputScan:
     """Return a scan file with a name."""
     return FileScan(
-        NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud), FileReader(None)
+        NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud),
+        FileReader(None),
+        NUSCENES,
     )
 
 
@@ -104,7 +107,7 @@ def test_names_of_scans_write_nothing_elsewhere(name: str, kind: str, link: str)
             write(base, [scan], kind)
         with suppress(InputError):  # the names are checked once more when a file is written
             (result,) = label([scan], [scan.load().scan])
-            scan.write_labels(base / "out", scan.load(), result, kind, NUSCENES)
+            scan.write_labels(base / "out", scan.load(), result, kind)
 
 
 @with_examples(100, token=NAMES, link=LINKS, is_mapped=st.booleans())
@@ -112,10 +115,8 @@ def test_tokens_write_nothing_elsewhere(token: str, link: str, is_mapped: bool) 
     with surroundings(link, make=with_token(token)) as base, suppress(InputError):
         dataset = open_dataset(f"nuscenes:{base}/data")
         written = class_map("coarse").target if is_mapped else None
-        scans = [DatasetScan(dataset, each) for each in dataset.records(dataset.sequences("all"))]
-        for scan in scans:
-            scan.written = written
-        write(base, scans)
+        records = dataset.records(dataset.sequences("all"))
+        write(base, [DatasetScan(dataset, record, written) for record in records])
 
 
 @with_examples(100, name=NAMES, link=LINKS, layout=st.sampled_from(list(MAKERS)))
@@ -160,10 +161,11 @@ def test_scans_among_the_outputs_are_not_changed(
         for name in ("a", "b", "c/a"):
             path = paths[len(scans) % len(paths)]
             scan = NamedScan(name, "source", path, ".bin", some_cloud)
-            scans.append(FileScan(scan, FileReader(None)))
+            scans.append(FileScan(scan, FileReader(None), NUSCENES))
         output = OutputOptions(out, kind, scores=True, uncertain=True, overwrite=overwrite)
         with suppress(InputError):
-            Pipeline(scans, label, output, NUSCENES).run({})
+            check_output(scans, output)
+            Pipeline(scans, label, output).run({})
         after = {path: (path.lstat().st_ino, path.read_bytes()) for path in paths}
         assert after == before
 
@@ -206,7 +208,7 @@ def test_an_output_folder_may_be_a_link() -> None:
     with surroundings() as base:
         (base / "out/real").mkdir(parents=True)
         (base / "out/link").symlink_to(base / "out/real")
-        Pipeline([named("a/b")], label, OutputOptions(base / "out/link"), NUSCENES).run({})
+        Pipeline([named("a/b")], label, OutputOptions(base / "out/link")).run({})
         assert (base / "out/real/a/b.label").is_file()
 
 

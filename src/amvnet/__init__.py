@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from amvnet import weights as weights
     from amvnet.data.datasets.simulated import simulate as simulate
     from amvnet.engines.base import Engine
+    from amvnet.engines.compute import Compute, EngineName, Precision
     from amvnet.errors import InputError as InputError
     from amvnet.inference.drive import drive as drive
     from amvnet.inference.fuse import fuse as fuse
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from amvnet.inference.listing import read_all as read_all
     from amvnet.inference.segmentation import Segmentation as Segmentation
     from amvnet.inference.segmenter import Segmenter as Segmenter
-    from amvnet.models.methods import EngineName, MethodName, Precision
+    from amvnet.models.methods import MethodName
     from amvnet.scan import Scan as Scan
     from amvnet.viewing.page import show as show
     from amvnet.weights.file import Weights as Weights
@@ -100,29 +101,53 @@ def load(
             library of the engine is missing; or if the sensor of the weights cannot be simulated
             for int8.
     """
+    from amvnet.engines.compute import Compute
+
+    compute = Compute(device, engine, precision)
+    return load_with(compute, weights, method, tau, graphs=graphs, report=report)
+
+
+def load_with(
+    compute: Compute,
+    weights: Weights | Path | str,
+    method: MethodName,
+    tau: float | None = None,
+    *,
+    graphs: bool = True,
+    report: Reporter = report_nothing,
+) -> Segmenter:
+    """Return the segmenter of `load`, given where and how the networks are computed."""
+    from amvnet.engines.precision import resolved
     from amvnet.inference.segmenter import Segmenter
     from amvnet.weights.file import Weights
     from amvnet.weights.file import load as load_weights
 
     loaded = weights if isinstance(weights, Weights) else load_weights(weights)
+    compute = resolved(compute)
     made: Engine
-    if engine == "torch":
+    if compute.engine == "torch":
         from amvnet.engines.torch import TorchEngine
 
-        made = TorchEngine(loaded, method, tau, device=device, precision=precision, graphs=graphs)
+        made = TorchEngine(
+            loaded,
+            method,
+            tau,
+            device=compute.device,
+            precision=compute.precision,
+            graphs=graphs,
+        )
     else:
-        from amvnet.engines.onnx import OnnxEngine, check_choice
+        from amvnet.engines.onnx import OnnxEngine
         from amvnet.export.cache import cached_networks
         from amvnet.export.int8 import SIMULATED
         from amvnet.models.methods import check_method
 
-        check_choice(engine, device, precision)
         check_method(method, loaded.parts)  # before the export, which takes long
-        is_int8 = engine == "int8"
+        is_int8 = compute.engine == "int8"
         networks = cached_networks(loaded, SIMULATED if is_int8 else None, report)
         made = OnnxEngine(loaded, networks, method, tau, int8=is_int8)
 
-    segmenter = Segmenter(loaded, made)
+    segmenter = Segmenter(loaded, made, compute.at_once)
     report(f"computing on {made.hardware} in {made.precision}")
     return segmenter
 

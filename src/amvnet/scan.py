@@ -143,6 +143,17 @@ def check_scan(scan: Scan) -> Scan:
     return scan
 
 
+def check_trainable(scan: Scan) -> int:
+    """Return the number of valid points; raise InputError if no network can be trained on them."""
+    valid = int(scan.valid.sum())
+    if valid < 2:  # batch norm needs two points to compute a variance
+        raise InputError(
+            f"{scan.name}: expected at least two valid points to train with, found {valid}; "
+            "leave the scan out"
+        )
+    return valid
+
+
 class TensorLike(Protocol):
     """The part of torch's tensors that `as_array` uses."""
 

@@ -109,6 +109,11 @@ class SimulatedScan:
         raw_ids: NDArray[np.uint32] = table[self.labels & CLASS_MASK] | self.labels & ~CLASS_MASK
         return raw_ids
 
+    def nuscenes_points(self) -> NDArray[np.float32]:
+        """Return the (N, 4) points with nuScenes' axes, and intensities as whole numbers to 255."""
+        xyz = self.points[:, :3] @ _TO_NUSCENES.T
+        return np.column_stack([xyz, np.round(self.points[:, 3] * 255)]).astype(np.float32)
+
     def nuscenes_categories(self) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the (N,) uint8 index of each point's category, and the names of all categories.
 
@@ -191,8 +196,7 @@ class NuScenesLayout:
         points_path = f"samples/LIDAR_TOP/{self.name}__LIDAR_TOP__{time}.pcd.bin"
         labels_path = f"lidarseg/{NUSCENES_VERSION}/{token}_lidarseg.bin"
 
-        xyz = scan.points[:, :3] @ _TO_NUSCENES.T
-        columns = np.column_stack([xyz, np.round(scan.points[:, 3] * 255), scan.ring])
+        columns = np.column_stack([scan.nuscenes_points(), scan.ring])
         write_whole(self.out / points_path, columns.astype("<f4").tobytes())
         categories, _ = scan.nuscenes_categories()
         write_whole(self.out / labels_path, categories.tobytes())

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from amvnet import read as read_scan
+from amvnet.config.yaml_files import read_yaml
 from amvnet.data.formats.find import find_scans
 from amvnet.data.labels.ids import write_ids
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy
-from amvnet.files import atomic_write, read_yaml
+from amvnet.files import atomic_write
 
 from fixtures.commands import fails
 

@@ -14,7 +14,7 @@ from amvnet.cli.main import COMMANDS, WITH_RECIPE
 from amvnet.cli.parser import Parser, make_parser
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
-from amvnet.models.methods import EngineName
+from amvnet.engines.compute import EngineName
 
 from fixtures.pages import DocsPage
 

@@ -21,7 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import amvnet
 from amvnet import Scan, Segmenter, load, simulate
 from amvnet import read as read_scan
-from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.engines.compute import Precision
 from amvnet.engines.precision import InPrecision, choose_device, choose_precision
 from amvnet.engines.streams import TwoStreams
 from amvnet.inference.journal import Entry, Journal
@@ -32,7 +32,6 @@ from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import LateFusion
 from amvnet.models.assertion import Disagreement
-from amvnet.models.methods import Precision
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
 from amvnet.models.views.points import PointBatch
@@ -558,7 +557,6 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
         scans,
         segment_by(Segmenter(weights, engine)),
         OutputOptions(tmp_path),
-        SEMANTICKITTI,
         batch=4,
     )
     results = list(pipeline.stream(scans, pipeline.write_or_explain))

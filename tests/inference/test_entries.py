@@ -190,8 +190,8 @@ def by_predict(world: World, points: np.ndarray) -> np.ndarray:
 
 def by_view(world: World, points: np.ndarray) -> np.ndarray:
     normaliser = Normaliser(world.segmenter.weights.expects)
-    scans, taxonomy = list_inputs([str(world.write(points))], normaliser=normaliser)
-    (shown,) = show_scans(scans, taxonomy, world.segmenter)
+    scans, _ = list_inputs([str(world.write(points))], normaliser=normaliser)
+    (shown,) = show_scans(scans, world.segmenter)
     return shown.labels["amvnet"]
 
 

@@ -264,8 +264,8 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
     raw = np.fromfile(tmp_path / "a.label", np.uint32)
     np.testing.assert_array_equal(raw, weights.taxonomy.to_raw(expected))
 
-    scans, taxonomy = list_inputs([f"{tmp_path}/a.npy"], normaliser=Normaliser(weights.expects))
-    (shown,) = show_scans(scans, taxonomy, segmenter)
+    scans, _ = list_inputs([f"{tmp_path}/a.npy"], normaliser=Normaliser(weights.expects))
+    (shown,) = show_scans(scans, segmenter)
     np.testing.assert_array_equal(shown.labels["amvnet"], expected)
     np.testing.assert_array_equal(segmenter(tmp_path / "a.npy").labels, expected)
 

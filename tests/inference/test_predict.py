@@ -16,8 +16,8 @@ import pytest
 import torch
 
 import amvnet
+from amvnet.cli.options import load_segmenter
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -27,6 +27,7 @@ from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation
+from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
@@ -126,7 +127,7 @@ def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> N
         return list(map(no_segmentation, scans))
 
     scans = counted_scans(8, Counter())
-    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, batch=4)
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), batch=4)
     outcomes = list(pipeline.stream(scans, pipeline.write_or_explain))
     assert [outcome for outcome in outcomes if isinstance(outcome, str)] == ["3: broken"]
     assert sum(isinstance(outcome, Entry) for outcome in outcomes) == 7
@@ -148,7 +149,7 @@ def test_a_scan_that_takes_all_memory_is_a_broken_one(tmp_path: Path, error: Exc
         return list(map(no_segmentation, scans))
 
     scans = counted_scans(8, Counter())
-    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, batch=4)
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), batch=4)
     outcomes = list(pipeline.stream(scans, pipeline.write_or_explain))
     (line,) = [outcome for outcome in outcomes if isinstance(outcome, str)]
     assert line.startswith("3: expected enough memory")
@@ -223,13 +224,19 @@ def test_a_killed_run_goes_on_where_it_stopped(
 
 
 @pytest.mark.parametrize("options", with_full(["", "--overwrite", "--resume"], ["--overwrite"]))
-def test_the_output_of_a_run_is_checked_once(
+def test_the_output_of_a_run_is_checked_once_before_the_networks_are_loaded(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str
 ) -> None:
-    checked: list[object] = []
-    monkeypatch.setattr("amvnet.inference.pipeline.check_outputs", lambda *_: checked.append(None))
+    steps: list[str] = []
+
+    def load(*arguments: Any) -> Segmenter:
+        steps.append("load")
+        return load_segmenter(*arguments)
+
+    monkeypatch.setattr("amvnet.inference.pipeline.check_outputs", lambda *_: steps.append("check"))
+    monkeypatch.setattr("amvnet.cli.commands.predict.load_segmenter", load)
     succeed(predict(world, tmp_path, options))
-    assert len(checked) == 1
+    assert steps == ["check", "load"]
 
 
 def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_path: Path) -> None:
@@ -419,7 +426,7 @@ def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, text: str, 
     with Journal(tmp_path, {"x": 1}) as journal, journal.path.open("a") as file:
         file.write(text)
 
-    read = read_journals(tmp_path, {"x": 1})
+    read = read_journals(tmp_path).entries
     assert list(read.values()) == ENTRIES[:done]
     with Journal(tmp_path, {"x": 1}, read.values()) as journal:
         lines = journal.path.read_text().splitlines()
@@ -439,7 +446,7 @@ def test_the_journal_is_at_most_as_late_as_the_writing(tmp_path: Path) -> None:
         lines.append(len((tmp_path / UNFINISHED).read_text().splitlines()) - 1)
         return list(map(no_segmentation, loaded))
 
-    Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI).run({})
+    Pipeline(scans, segment, OutputOptions(tmp_path)).run({})
     assert all(line >= scan - 2 for scan, line in enumerate(lines))
 
 
@@ -495,7 +502,6 @@ def test_few_scans_are_in_memory_however_many_there_are(
         scans,
         segment_by(amvnet.load(str(world / WEIGHTS))),
         OutputOptions(tmp_path),
-        SEMANTICKITTI,
         at_once=at_once,
     )
     outcomes = pipeline.stream(scans, pipeline.write_or_explain)
@@ -524,7 +530,7 @@ def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
         return list(map(no_segmentation, scans))
 
     scans = counted_scans(2, Counter())
-    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, at_once=2)
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), at_once=2)
     first, second = pipeline.stream(scans, pipeline.write_or_explain)
     assert isinstance(first, Entry)
     assert isinstance(second, Entry)
@@ -637,12 +643,12 @@ def test_scans_that_vanish_during_a_run_are_listed_and_the_others_are_done(
 
 def test_a_scan_that_vanishes_after_it_was_read_has_its_labels(world: Path, tmp_path: Path) -> None:
     make_streets(tmp_path / "data", ("08",), scans=1)
-    (scan,), taxonomy = list_inputs([str(tmp_path / "data")])
+    (scan,), _ = list_inputs([str(tmp_path / "data")])
     loaded = scan.load()
     ids = np.ones(len(loaded.scan), np.uint8)
     scan.path.unlink()
     result = Segmentation(ids, ids == 0, np.zeros((len(ids), 19), np.float32))
-    path = scan.write_labels(tmp_path / "out", loaded, result, "label", taxonomy)
+    path = scan.write_labels(tmp_path / "out", loaded, result, "label")
     assert np.fromfile(path, np.uint32).shape == ids.shape
 
 

@@ -142,8 +142,8 @@ def _ranked(dataset: Dataset, segmenter: Segmenter) -> Any:
 
 
 def _viewed(dataset: Dataset, segmenter: Segmenter) -> Any:
-    scans, taxonomy = list_inputs([dataset.spec])
-    shown = show_scans(scans, taxonomy, segmenter)
+    scans, _ = list_inputs([dataset.spec])
+    shown = show_scans(scans, segmenter)
     return [[each.name, each.labels["amvnet"].tolist()] for each in shown]
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from rich import progress as rich_progress
 from rich.console import Console, RenderableType
 
-from amvnet.errors import without_secrets
+from amvnet.fleet.secrets import without_secrets
 from amvnet.progress import Progress, Tenths
 
 LONGEST_LINE = 5000  # longest line that is printed in full, characters

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import report, silence
 from amvnet.config.bounds import Share
+from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.models.methods import Compute, MethodName
+from amvnet.models.methods import MethodName
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
@@ -313,20 +314,10 @@ def load_segmenter(
     Raises:
         InputError: if `amvnet.load` cannot make the segmenter.
     """
-    from amvnet import load
+    from amvnet import load_with
     from amvnet.runtime.memory import keep_freed_memory
 
-    segmenter = load(
-        weights,
-        compute.device,
-        method,
-        compute.precision,
-        compute.engine,
-        tau=tau,
-        report=report,
-    )
-    if compute.at_once is not None:
-        segmenter.at_once = compute.at_once
+    segmenter = load_with(compute, weights, method, tau, report=report)
     if segmenter.device == "cpu":
         keep_freed_memory()
     return segmenter

@@ -10,8 +10,8 @@ from typing import Any, get_type_hints
 from amvnet.cli.parser import Parser, field_texts, first_line, metavar_of
 from amvnet.config.nested import replace_values
 from amvnet.config.schema import Recipe
+from amvnet.config.yaml_files import parse_yaml
 from amvnet.errors import InputError
-from amvnet.files import parse_yaml
 
 SECTIONS = ("model", "training")  # the sections of a recipe whose values are options
 HELP_ALL = "--help-all"

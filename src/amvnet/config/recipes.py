@@ -8,8 +8,8 @@ from typing import Any
 
 from amvnet.config.nested import from_dict, merge_trees
 from amvnet.config.schema import Recipe
+from amvnet.config.yaml_files import read_yaml
 from amvnet.errors import InputError, did_you_mean, shown
-from amvnet.files import read_yaml
 
 # Folder of the built-in recipes.
 _FOLDER = resources.files("amvnet.config") / "recipes"

@@ -14,6 +14,7 @@ from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
+from amvnet.scan import check_trainable
 
 SHOWN_IDS = 5  # largest number of unknown ids that a message lists
 
@@ -285,10 +286,4 @@ def _contents_of(dataset: Dataset, record: ScanRecord) -> Contents:
     counts = np.bincount(raw.astype(np.int64) & INSTANCE_MASK)
     ids = {int(raw_id): int(counts[raw_id]) for raw_id in np.flatnonzero(counts)}
 
-    valid = int(scan.valid.sum())
-    if valid < 2:  # batch norm needs two points to compute a variance
-        raise InputError(
-            f"{scan.name}: expected at least two valid points to train with, found {valid}; "
-            "leave the scan out"
-        )
-    return Contents(valid, ids)
+    return Contents(check_trainable(scan), ids)

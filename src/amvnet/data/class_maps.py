@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from amvnet.config.yaml_files import parse_yaml, read_yaml
 from amvnet.data.taxonomy import Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, errors_of, shown
-from amvnet.files import parse_yaml, read_yaml
 
 COARSE_NAME = "coarse"
 

@@ -7,10 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from amvnet.engines.compute import Precision
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.assertion import Disagreement
 from amvnet.models.layers import freeze
-from amvnet.models.methods import METHODS, MethodName, Precision, check_method
+from amvnet.models.methods import METHODS, MethodName, check_method
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid

@@ -7,16 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from amvnet.engines.base import Engine, WithUnet, build_model
-from amvnet.engines.precision import check_device, choose_device, choose_precision
 from amvnet.engines.streams import side_by_side
 from amvnet.errors import InputError
-from amvnet.models.methods import METHODS, EngineName, MethodName, Precision
+from amvnet.models.methods import METHODS, MethodName
 from amvnet.models.polar_net import PolarNet
 from amvnet.weights.file import Weights
 
@@ -25,26 +24,6 @@ TENSORRT = "TensorrtExecutionProvider"
 PROVIDERS = (TENSORRT, "CUDAExecutionProvider", "CPUExecutionProvider")
 RANGE_NET = "range_net"  # the graph of the range-view network
 UNET = "polar_map"  # the graph of the U-Net in the bird's-eye-view network
-
-
-def check_choice(engine: EngineName, device: str, precision: Precision) -> None:
-    """Check that an engine of ONNX Runtime has a device and a precision.
-
-    Raises:
-        InputError: if there is no such engine, or it does not have the device or the precision.
-    """
-    engines = get_args(EngineName)
-    if engine not in engines:
-        raise InputError(
-            f"expected an engine of {', '.join(engines)}, found {engine!r}; use one of them"
-        )
-    device = check_device(choose_device(device, engine))
-    precision = choose_precision(precision, device)
-    if device != "cpu" or precision != "float32":
-        raise InputError(
-            f"expected float32 on cpu for the engine {engine}, found {precision} on {device}; "
-            "use torch"
-        )
 
 
 @dataclass(frozen=True)

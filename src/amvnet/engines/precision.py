@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from typing import Any
+from dataclasses import replace
+from typing import Any, get_args
 
 import torch
 from torch import Tensor, nn
 
+from amvnet.engines.compute import ONNX_ENGINES, PRECISIONS, Compute, EngineName, Precision
 from amvnet.errors import InputError
-from amvnet.models.methods import ONNX_ENGINES, PRECISIONS, Precision
 
 
 class InPrecision(nn.Module):
@@ -76,6 +77,29 @@ def choose_precision(precision: Precision, device: str) -> Precision:
         return precision
     has_bfloat16 = kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
     return "bfloat16" if has_bfloat16 else "float32"
+
+
+def resolved(compute: Compute) -> Compute:
+    """Return where and how the networks are computed on this machine, without "auto".
+
+    Raises:
+        InputError: if there is no such engine, device or precision, or the engine does not have the
+            device or the precision.
+    """
+    engine = compute.engine
+    engines = get_args(EngineName)
+    if engine not in engines:
+        raise InputError(
+            f"expected an engine of {', '.join(engines)}, found {engine!r}; use one of them"
+        )
+    device = check_device(choose_device(compute.device, engine))
+    precision = choose_precision(compute.precision, device)
+    if engine in ONNX_ENGINES and (device, precision) != ("cpu", "float32"):
+        raise InputError(
+            f"expected float32 on cpu for the engine {engine}, found {precision} on {device}; "
+            "use torch"
+        )
+    return replace(compute, device=device, precision=precision)
 
 
 @contextmanager

@@ -6,11 +6,12 @@ import torch
 from torch import nn
 
 from amvnet.engines.base import Engine, WithUnet, build_model
+from amvnet.engines.compute import Precision
 from amvnet.engines.graphs import Captured, GraphCheck
 from amvnet.engines.precision import InPrecision, check_device, choose_device, choose_precision
 from amvnet.engines.streams import TwoStreams, side_by_side
 from amvnet.models.amvnet import AMVNet, Scores
-from amvnet.models.methods import MethodName, Precision
+from amvnet.models.methods import MethodName
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
 from amvnet.weights.file import Weights

@@ -14,7 +14,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.evaluation.scoring import stream_labelled
-from amvnet.inference.segmentation import expand_labels, expand_to_scan
+from amvnet.inference.segmentation import expand_labels, expand_to_scan, scores_by_method
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import replace_uncertain
 from amvnet.models.assertion import Disagreement, cosine_similarity
@@ -130,11 +130,8 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
     assert g is not None
 
     # Compute the labels of every method.
-    ids = {"rv": expand_labels(f, scan.valid), "bev": expand_labels(g, scan.valid)}
-    for name, method in METHODS.items():
-        if method.ensemble is not None:
-            ids[name] = expand_labels(method.ensemble(f, g), scan.valid)
-    ids["amvnet"] = expand_labels(scores.merged, scan.valid)
+    by_method = scores_by_method(scores, segmenter.method, METHODS)
+    ids = {name: expand_labels(values, scan.valid) for name, values in by_method.items()}
     uncertain = expand_to_scan(scores.uncertain, scan.valid)
 
     # Compute the head's labels of all points that some tau selects.

@@ -23,11 +23,9 @@ from amvnet.evaluation.top_view import PICTURE, TopView, draw_scan
 from amvnet.files import inside
 from amvnet.inference.drive import Drives
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmentation import expand_labels, expand_to_scan
+from amvnet.inference.segmentation import expand_labels, expand_to_scan, scores_by_method
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.amvnet import Scores
 from amvnet.models.methods import METHODS, PAPER_METHODS
-from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import vote
 from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
@@ -214,47 +212,26 @@ def label_by_weights(
     return Labeller(label, segmenter.taxonomy, classes, segmenter.at_once, segmenter)
 
 
+@torch.inference_mode()
 def labels_by_method(
     segmenter: Segmenter, scan: Scan, methods: Sequence[str] = PAPER_METHODS
 ) -> MethodLabels:
     """Label the N points of a scan by a segmenter's method and by the methods that it includes.
 
-    AMVNet and the ensembles include all ensembles and each single network. Other `methods` are left
-    out. The networks run only once.
+    Other `methods` are left out (`scores_by_method`). The networks run only once.
     """
     batch = segmenter.batch([scan])
     scores = segmenter.engine.score(batch)
 
-    labels = {}
-    for name in methods:
-        values: Tensor | None = scores.merged
-        if name != segmenter.method:
-            values = _scores_by(name, segmenter, scores, batch)
-        if values is not None:
-            labels[name] = expand_labels(values, scan.valid)
+    def vote_by_neighbours(f: Tensor) -> Tensor:
+        return vote(f, batch, segmenter.model.range_view.project(batch))
 
+    by_method = scores_by_method(scores, segmenter.method, methods, vote_by_neighbours)
+    labels = {name: expand_labels(values, scan.valid) for name, values in by_method.items()}
     uncertain = None
     if METHODS[segmenter.method].has_two_networks:
         uncertain = expand_to_scan(scores.uncertain, scan.valid)
     return MethodLabels(labels, uncertain)
-
-
-@torch.inference_mode()
-def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatch) -> Tensor | None:
-    """Return the scores (P, K) by another method, or None if the segmenter does not include it."""
-    f = scores.rv
-    g = scores.bev
-    ensemble = METHODS[name].ensemble
-
-    if name == "rv":
-        return f
-    if name == "bev":
-        return g
-    if name == "rv-knn" and f is not None:
-        return vote(f, batch, segmenter.model.range_view.project(batch))
-    if ensemble is not None and f is not None and g is not None:
-        return ensemble(f, g)
-    return None
 
 
 def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = None) -> Labeller:

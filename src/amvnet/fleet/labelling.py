@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
@@ -18,16 +19,18 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from amvnet import load
+from amvnet import load_with
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import BAGS, FOLDER, ending_of
 from amvnet.data.formats.find import NamedScan
 from amvnet.data.formats.registry import read_file
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError, without_secrets
+from amvnet.engines.compute import Compute
+from amvnet.errors import InputError
 from amvnet.files import temporary_folder
 from amvnet.fleet.manifest import check_outside, split_name
 from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, results_schema
+from amvnet.fleet.secrets import without_secrets
 from amvnet.fleet.storage import Place
 from amvnet.inference.listing import FileReader, FileScan, Outcome
 from amvnet.inference.pipeline import Pipeline
@@ -35,7 +38,6 @@ from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation, uncertain_share
-from amvnet.models.methods import Compute
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.normalise import Normaliser
@@ -72,16 +74,8 @@ class LabelScans:
     ) -> None:
         self.request = request
         self.batch = batch
-        self._segmenter = load(
-            request.weights,
-            compute.device,
-            request.method,
-            request.precision,
-            request.engine,
-            tau=request.tau,
-        )
-        if compute.at_once is not None:
-            self._segmenter.at_once = compute.at_once
+        compute = replace(compute, engine=request.engine, precision=request.precision)
+        self._segmenter = load_with(compute, request.weights, request.method, request.tau)
         if self._segmenter.device == "cpu":
             keep_freed_memory()
         self._schema = results_schema(request.taxonomy).append(IS_FATAL)
@@ -133,7 +127,6 @@ class LabelScans:
                 scans,
                 segment_by(self._segmenter, request.classes),
                 request.output(self._out.local or folder),
-                request.taxonomy,
                 batch=self.batch,
                 at_once=self._segmenter.at_once,
             )
@@ -235,10 +228,8 @@ def _fetch(
             place = Place.of(row["path"])
             path = place.local or folder / Path(place.path).name
             read = partial(_read_fetched, pool.submit(place.fetch, folder), request)
-            scan = NamedScan(row["name"], row["drive"], path, ending="", read=read)
-            reader.expect(scan)
-            scans.append(FileScan(scan, reader))
-        yield scans, temporary / "labels"
+            scans.append(NamedScan(row["name"], row["drive"], path, ending="", read=read))
+        yield reader.scans(scans, request.taxonomy), temporary / "labels"
 
 
 def _read_fetched(fetching: Future[Path], request: LabellingRequest) -> Cloud:

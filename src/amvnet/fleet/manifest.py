@@ -19,7 +19,8 @@ from pyarrow.fs import FileType
 from amvnet.data.datasets.open import is_dataset
 from amvnet.data.formats.detect import BAGS, GZIP, named_ending
 from amvnet.data.formats.find import is_scan_name
-from amvnet.errors import InputError, reason_of, without_secrets
+from amvnet.errors import InputError, reason_of
+from amvnet.fleet.secrets import without_secrets
 from amvnet.fleet.storage import Place
 
 MANIFESTS = (".parquet", ".csv")

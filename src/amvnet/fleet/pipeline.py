@@ -20,6 +20,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from amvnet.engines.compute import Compute
 from amvnet.engines.precision import choose_precision
 from amvnet.errors import InputError, reason_of
 from amvnet.fleet.labelling import DEFAULTS, IS_FATAL, LabelScans, MeasureSensors
@@ -30,7 +31,7 @@ from amvnet.inference.journal import Entry
 from amvnet.inference.pipeline import check_faults
 from amvnet.inference.predict import report_certainty
 from amvnet.inference.request import LabellingRequest
-from amvnet.models.methods import METHODS, Compute
+from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.sensors.measure import MEASURED_SCANS
 

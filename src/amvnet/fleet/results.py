@@ -22,7 +22,7 @@ from amvnet.errors import InputError
 from amvnet.files import remove_unfinished
 from amvnet.fleet.manifest import NameSet
 from amvnet.fleet.storage import Place, reaching
-from amvnet.inference.journal import check_settings
+from amvnet.inference.journal import changed_settings, check_unchanged
 from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.frame import Frame
 from amvnet.sensors.lasers import SensorGeometry
@@ -251,7 +251,7 @@ def _check_same(place: Place, settings: Mapping[str, Any]) -> None:
     with suppress(ValueError, RecursionError):  # no text, no JSON, or a number with too many digits
         earlier = json.loads(content)
     known = earlier if isinstance(earlier, dict) else {}
-    check_settings(place.url, settings, earlier=known, advice="change --out")
+    check_unchanged(place.url, changed_settings(settings, known), advice="change --out")
 
 
 def _write_settings(place: Place, settings: Mapping[str, Any]) -> None:

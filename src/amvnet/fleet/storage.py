@@ -13,8 +13,9 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import fs
 
-from amvnet.errors import CREDENTIALS, InputError, reason_of, without_secrets
+from amvnet.errors import InputError, reason_of
 from amvnet.files import atomic_write
+from amvnet.fleet.secrets import CREDENTIALS, without_secrets
 
 # Options in the URL of a storage, by its scheme. Without this one, pyarrow uploads even a small
 # file in three requests.

@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.data.formats.bag_poses import BagPoses
 from amvnet.data.poses import Poses, check_rigid, read_poses
 from amvnet.data.spacing import evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit
 from amvnet.errors import InputError
-from amvnet.inference.listing import DatasetScan, FileScan, InputScan, LoadedScan, Outcome
+from amvnet.inference.listing import InputScan, LoadedScan, Outcome
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
@@ -273,7 +272,7 @@ def find_poses(
         name = str(path) if is_file else source
         poses, where = _recorded(members, path, report)
         if poses is None:
-            bag = _bag_of(members)
+            bag = members[0].bag
             topic = None if bag is None else bag.odometry()
             other = "" if topic is None else f"; --poses {topic} takes those of the bag"
             report(f"{name}: estimating the poses of {counted(len(members), 'scan')}{other}")
@@ -292,7 +291,7 @@ def _recorded(
 ) -> tuple[Poses | None, str]:
     """Return the poses (N, 4, 4) of a drive, or None if they are unknown, and what holds them."""
     if path is not None:
-        bag = _bag_of(scans)
+        bag = scans[0].bag
         if bag is not None and not path.is_file():
             return bag.at_scans(path.as_posix(), report), path.as_posix()
         track = read_poses(path)
@@ -300,9 +299,7 @@ def _recorded(
         times = None if len(track.poses) == len(scans) else _times(scans)
         return track.at(times, len(scans)), "the file"
 
-    records = [scan.record for scan in scans if isinstance(scan, DatasetScan)]
-    first = scans[0]
-    return first.dataset.poses(records) if isinstance(first, DatasetScan) else None, "the dataset"
+    return scans[0].poses(scans), "the dataset"
 
 
 def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:
@@ -319,18 +316,12 @@ def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:
     return np.array(poses)
 
 
-def _bag_of(scans: Sequence[InputScan]) -> BagPoses | None:
-    """Return the poses of the bag that holds the scans of a recording, or None if it is no bag."""
-    first = scans[0]
-    return first.scan.bag_poses if isinstance(first, FileScan) else None
-
-
 def _times(scans: Sequence[InputScan]) -> list[float] | None:
     """Return the times of scans in seconds: their stamps in a bag, or numbers that are their names.
 
     Return None if a name is no number. Large numbers are nanoseconds.
     """
-    bag = _bag_of(scans)
+    bag = scans[0].bag
     if bag is not None:
         return bag.times()
 

@@ -15,7 +15,7 @@ import torch
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults
+from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults, check_output
 from amvnet.inference.reading import checked_scan
 from amvnet.inference.scores import LEAST_PROBABILITY, ScorePair, as_probabilities, have_opinion
 from amvnet.inference.segmentation import Segmentation, fetch, unpack
@@ -176,6 +176,7 @@ def fuse_files(
     for scan in scans:  # raises before anything is written
         scores += [pair.a.find(scan.scores_path), pair.b.find(scan.scores_path)]
     output = replace(output, also_read=[*output.also_read, *scores])
+    check_output(scans, output)
 
     silent: Counter[str] = Counter()  # by side, the points without an opinion of the model
 
@@ -188,7 +189,7 @@ def fuse_files(
                 silent[side] += int(np.count_nonzero(~have_opinion(values[scan.valid])))
         return results
 
-    pipeline = Pipeline(scans, segment, output, taxonomy)
+    pipeline = Pipeline(scans, segment, output)
     entries, faults = pipeline.run({"fused": repr(pair)}, progress)
     check_faults(faults, len(scans))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -89,22 +89,31 @@ class Journal:
         return {entry.scan: entry for entry in entries}
 
 
-def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]:
-    """Return the entries of an earlier run into a folder, by the name of the scan.
+class EarlierRun(NamedTuple):
+    """What the journals of an earlier run say.
 
-    Raises:
-        InputError: if that run had other settings.
+    Attributes:
+        entries: the scans that are done, by their names.
+        settings: the settings of each journal.
     """
-    done: dict[str, Entry] = {}
+
+    entries: dict[str, Entry]
+    settings: list[dict[str, Any]]
+
+    def changed(self, settings: Mapping[str, Any]) -> list[str]:
+        """Return the settings that have another value in the earlier run."""
+        return [key for earlier in self.settings for key in changed_settings(settings, earlier)]
+
+
+def read_journals(folder: Path) -> EarlierRun:
+    """Read the journals in a folder; a folder without an earlier run has none."""
+    run = EarlierRun({}, [])
     for path in (folder / JOURNAL, folder / UNFINISHED):
-        if not path.is_file():
-            continue
-        earlier_settings, entries = _read(path)
-        advice = "start over with --overwrite instead of --resume"
-        check_settings(folder, settings, earlier=earlier_settings, advice=advice)
-        for entry in entries:
-            done[entry.scan] = entry
-    return done
+        if path.is_file():
+            settings, entries = _read(path)
+            run.settings.append(settings)
+            run.entries.update((entry.scan, entry) for entry in entries)
+    return run
 
 
 def describe_other_run(folder: Path, settings: Mapping[str, Any], scans: Set[str]) -> str:
@@ -115,34 +124,31 @@ def describe_other_run(folder: Path, settings: Mapping[str, Any], scans: Set[str
         settings: the settings of the new run, as `Journal` takes them.
         scans: the names of the new run's scans, whose files it replaces.
     """
-    others: set[str] = set()
-    changed: set[str] = set()
-    for path in (folder / JOURNAL, folder / UNFINISHED):
-        if path.is_file():
-            earlier_settings, entries = _read(path)
-            others |= {entry.scan for entry in entries} - scans
-            changed |= {key for key in settings if settings[key] != earlier_settings.get(key)}
+    earlier = read_journals(folder)
+    others = earlier.entries.keys() - scans
     if not others:
         return ""
 
+    changed = set(earlier.changed(settings))
     text = f"{folder} has the labels of {counted(len(others), 'scan')} of an earlier run"
     if changed:
         text += f", made with other values of {', '.join(sorted(changed))}"
     return f"{text}; give each run a folder of its own"
 
 
-def check_settings(
-    place: object, settings: Mapping[str, Any], earlier: Mapping[str, Any], advice: str
-) -> None:
+def changed_settings(settings: Mapping[str, Any], earlier: Mapping[str, Any]) -> list[str]:
+    """Return the settings of a run that have another value in an earlier run."""
+    return [key for key in settings if settings[key] != earlier.get(key)]
+
+
+def check_unchanged(place: object, changed: Sequence[str], advice: str) -> None:
     """Raise InputError if the earlier run in a place had other settings.
 
     Args:
         place: the beginning of the message.
-        settings: the settings of this run.
-        earlier: the settings of the earlier run.
+        changed: the settings that have changed.
         advice: the alternative to the same settings, for the message.
     """
-    changed = [key for key in settings if settings[key] != earlier.get(key)]
     if changed:
         raise InputError(
             f"{place}: expected the settings of the earlier run, found other values of "

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,12 +13,14 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
 from amvnet.data.datasets.open import is_dataset, open_dataset
+from amvnet.data.formats.bag_poses import BagPoses
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.labels.writers import KINDS, write_scan_labels
+from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
@@ -57,37 +60,33 @@ class LoadedScan:
     file_xyz: np.ndarray | None = None
 
 
-class DatasetScan:
-    """A scan of a dataset that is not read yet; its labels have the dataset's format and classes.
+class InputScan(ABC):
+    """A scan that is not read yet.
 
     Attributes:
-        written: the classes of the labels that are written; by default the classes of the dataset.
         name: the name in messages, unique among the scans of one input.
         title: a short name for people who look at the scan.
         source: the recording of the scan: a sequence, a bag or a folder.
         path: the file that holds the scan.
         scores_path: the path of the `.npz` of its scores, relative to a folder of predictions.
+        bag: the poses of the bag that holds the scan; None if no bag does.
     """
 
-    def __init__(self, dataset: Dataset, record: ScanRecord) -> None:
-        self.dataset = dataset
-        self.record = record
-        self.written: Taxonomy | None = None
-        self.name = record.name
-        self.title = _title_of(record)
-        self.source = record.sequence
-        self.path = record.points_path
-        self.scores_path = Path(record.prediction).with_suffix(".npz")
+    bag: BagPoses | None = None
+
+    def __init__(self, name: str, title: str, source: str, path: Path, scores_path: Path) -> None:
+        self.name = name
+        self.title = title
+        self.source = source
+        self.path = path
+        self.scores_path = scores_path
 
     @property
+    @abstractmethod
     def files(self) -> list[Path]:
         """The files of the scan's points and labels."""
-        return self.dataset.files_of(self.record)
 
-    def labels_path(self, kind: str) -> Path:
-        """Return the path of the scan's label file, relative to a folder of predictions."""
-        return Path(self.record.prediction)
-
+    @abstractmethod
     def load(self, labels: bool = False) -> LoadedScan:
         """Read the scan.
 
@@ -97,21 +96,86 @@ class DatasetScan:
         Raises:
             InputError: if the scan cannot be read.
         """
-        return LoadedScan(self.dataset.read(self.record, labels=labels))
 
-    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+    def poses(self, scans: Sequence[InputScan]) -> Poses | None:
+        """Return the poses (N, 4, 4) that the dataset gives scans of this recording, or None."""
+        return None
+
+    @abstractmethod
+    def labels_path(self, kind: str) -> Path:
+        """Return the path of the scan's label file, relative to a folder of predictions.
+
+        Args:
+            kind: the format, one of `writers.KINDS`; datasets have their own format.
+        """
+
+    @abstractmethod
+    def read_labels(self, path: Path, count: int) -> np.ndarray:
         """Read the (N,) train ids of the points; raise InputError if they cannot be read.
 
         Args:
-            path: a folder of predictions.
-            count, taxonomy: not used; the dataset knows them.
+            path: a folder of predictions, or the label file of a scan that is in no dataset.
+            count: N, the number of points.
         """
+
+    @abstractmethod
+    def write_labels(
+        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str
+    ) -> Path:
+        """Write labels into a folder of predictions; return the path of the file.
+
+        Args:
+            loaded: what `load` returned.
+            kind: the format, as `labels_path` takes it.
+        """
+
+
+class DatasetScan(InputScan):
+    """A scan of a dataset, whose labels have the dataset's format.
+
+    Args:
+        dataset: the dataset.
+        record: the scan.
+        written: the classes of the labels that are written; by default the classes of the dataset.
+    """
+
+    def __init__(
+        self, dataset: Dataset, record: ScanRecord, written: Taxonomy | None = None
+    ) -> None:
+        scores_path = Path(record.prediction).with_suffix(".npz")
+        super().__init__(
+            record.name, _title_of(record), record.sequence, record.points_path, scores_path
+        )
+        self.dataset = dataset
+        self.record = record
+        self.written = written
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of the scan's points and labels."""
+        return self.dataset.files_of(self.record)
+
+    def load(self, labels: bool = False) -> LoadedScan:
+        """Read the scan."""
+        return LoadedScan(self.dataset.read(self.record, labels=labels))
+
+    def poses(self, scans: Sequence[InputScan]) -> Poses | None:
+        """Return the poses of the dataset, if it has any."""
+        records = [scan.record for scan in scans if isinstance(scan, DatasetScan)]
+        return self.dataset.poses(records)
+
+    def labels_path(self, kind: str) -> Path:
+        """Return the path that the dataset gives predictions."""
+        return Path(self.record.prediction)
+
+    def read_labels(self, path: Path, count: int) -> np.ndarray:
+        """Read labels from a folder of predictions."""
         return self.dataset.read_prediction(self.record, path)
 
     def write_labels(
-        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
+        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str
     ) -> Path:
-        """Write labels into a folder of predictions; return the path of the file."""
+        """Write the labels as a prediction of the dataset."""
         # The file may have vanished since it was read.
         count = len(loaded.scan)
         return self.dataset.write_prediction(
@@ -142,10 +206,14 @@ class FileReader:
         self.is_normalising = normaliser is not None and normaliser.expected is not None
         self._clouds: dict[tuple[str, str], Cloud] = {}  # by source and name; all of one source
 
-    def expect(self, scan: NamedScan) -> None:
-        """Announce a scan; announce the scans of a source in their order."""
-        if self.normaliser is not None:
-            self.normaliser.expect(scan.source, partial(self._read_and_keep, scan))
+    def scans(self, scans: Iterable[NamedScan], taxonomy: Taxonomy) -> list[FileScan]:
+        """Return scans that this reader reads, those of a source in their order."""
+        found = []
+        for scan in scans:
+            if self.normaliser is not None:
+                self.normaliser.expect(scan.source, partial(self._read_and_keep, scan))
+            found.append(FileScan(scan, self, taxonomy))
+        return found
 
     def read(self, scan: NamedScan) -> LoadedScan:
         """Read a scan; raise InputError if it cannot be read, or no point is usable."""
@@ -169,70 +237,57 @@ class FileReader:
         return cloud
 
 
-class FileScan:
-    """A scan in a file or a bag that is not read yet; `DatasetScan` documents the attributes."""
+class FileScan(InputScan):
+    """A scan in a file or a bag.
 
-    def __init__(self, scan: NamedScan, reader: FileReader) -> None:
+    Args:
+        scan: the scan.
+        reader: reads the scan.
+        taxonomy: the classes of its labels in files.
+    """
+
+    def __init__(self, scan: NamedScan, reader: FileReader, taxonomy: Taxonomy) -> None:
+        super().__init__(scan.name, scan.name, scan.source, scan.path, Path(f"{scan.name}.npz"))
+        self.bag = scan.bag_poses
         self.scan = scan
         self.reader = reader
-        self.name = scan.name
-        self.title = scan.name
-        self.source = scan.source
-        self.path = scan.path
-        self.scores_path = Path(f"{scan.name}.npz")
+        self.taxonomy = taxonomy
 
     @property
     def files(self) -> list[Path]:
         """The file that holds the scan, or all files of a bag that is a folder."""
         return [*self.path.iterdir()] if self.path.is_dir() else [self.path]
 
-    def labels_path(self, kind: str) -> Path:
-        """Return the path of the scan's label file, relative to a folder of predictions.
-
-        Args:
-            kind: the format, one of `writers.KINDS`.
-        """
-        return Path(f"{self.name}.{kind}")
-
     def load(self, labels: bool = False) -> LoadedScan:
-        """Read the scan; raise InputError if it cannot be read."""
+        """Read the scan; a scan file has no ground truth."""
         return self.reader.read(self.scan)
 
-    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-        """Read the (N,) train ids of the points; raise InputError if they cannot be read.
+    def labels_path(self, kind: str) -> Path:
+        """Return the name of the scan, with the format as its ending."""
+        return Path(f"{self.name}.{kind}")
 
-        Args:
-            path: a label file, or a folder of predictions.
-            count: N, the number of points.
-            taxonomy: turns raw ids into train ids.
-        """
+    def read_labels(self, path: Path, count: int) -> np.ndarray:
+        """Read labels from a label file, or from a folder of predictions."""
         if path.is_dir():
             paths = [path / self.labels_path(kind) for kind in KINDS]
             path = next(filter(Path.is_file, paths), paths[0])
-        return read_scan_labels(path, count, taxonomy)
+        return read_scan_labels(path, count, self.taxonomy)
 
     def write_labels(
-        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
+        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str
     ) -> Path:
-        """Write labels into a folder of predictions; return the path of the file.
-
-        Args:
-            loaded: what `load` returned.
-            kind: one of `writers.KINDS`.
-            taxonomy: turns train ids into raw ids.
-        """
+        """Write the labels in one of the formats `writers.KINDS`."""
         assert loaded.file_xyz is not None
         return write_scan_labels(
             inside(folder, self.name),
             kind,
             loaded.file_xyz,
             result.labels,
-            taxonomy,
+            self.taxonomy,
             uncertain=result.uncertain if result.has_two_networks else None,
         )
 
 
-InputScan = DatasetScan | FileScan
 # A scan that was read and segmented, or the error that prevented it.
 Outcome = tuple[InputScan, LoadedScan | None, Segmentation | InputError]
 
@@ -242,6 +297,7 @@ def list_inputs(
     options: ScanOptions = ScanOptions(),
     taxonomy: Taxonomy | None = None,
     normaliser: Normaliser | None = None,
+    written: Taxonomy | None = None,
 ) -> tuple[list[InputScan], Taxonomy]:
     """List the scans of all inputs, in their order.
 
@@ -253,6 +309,7 @@ def list_inputs(
             dataset has its own classes, a scan file whose name ends in `.pcd.bin` has the classes
             of nuScenes, and any other scan file has the classes of SemanticKITTI.
         normaliser: normalises scan files to weights; without it, they stay unchanged.
+        written: the classes of the labels that are written; by default the classes above.
 
     Returns:
         The scans, and the classes of their labels.
@@ -269,17 +326,15 @@ def list_inputs(
             if normaliser is not None:
                 dataset = normalised(dataset, normaliser)
             for record in choose_records(dataset, options.sequences, options.split):
-                scans.append(DatasetScan(dataset, record))
+                scans.append(DatasetScan(dataset, record, written))
             taxonomies.append(dataset.taxonomy)
             continue
 
         is_alone = len(inputs) == 1
         named_scans = list(list_scans(spec, options.topic, options.layout, is_alone))
-        for scan in named_scans:
-            reader.expect(scan)
-            scans.append(FileScan(scan, reader))
         is_nuscenes = named_scans[0].ending == NUSCENES_ENDING
         taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
+        scans += reader.scans(named_scans, written or taxonomies[-1])
 
     if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
         raise InputError(

@@ -21,14 +21,12 @@ from amvnet.data.labels.writers import (
     SCORES,
     SIGNATURES,
     UNCERTAIN,
-    check_kind,
     write_uncertain,
 )
-from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken, memory_for
 from amvnet.files import atomic_write, inside
 from amvnet.inference.drive import Drives
-from amvnet.inference.journal import UNFINISHED, Entry, Journal, read_journals
+from amvnet.inference.journal import UNFINISHED, Entry, Journal, check_unchanged, read_journals
 from amvnet.inference.listing import InputScan, LoadedScan, Outcome
 from amvnet.inference.scan_stream import READ_AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
@@ -56,9 +54,6 @@ class OutputOptions:
         resume: leave out the scans that an earlier run into the same folder has done.
         also_read: other files that the command reads, which must not be replaced; what names no
             file is ignored.
-
-    Raises:
-        InputError: if the format is unknown.
     """
 
     folder: Path
@@ -68,9 +63,6 @@ class OutputOptions:
     overwrite: bool = False
     resume: bool = False
     also_read: Sequence[Path | str | None] = ()
-
-    def __post_init__(self) -> None:
-        check_kind(self.kind)
 
     def files_of(self, scan: InputScan) -> dict[Path, Signature]:
         """Return the files that are written for a scan, by the path relative to the folder."""
@@ -92,29 +84,24 @@ Written = TypeVar("Written")
 
 @dataclass(frozen=True)
 class Pipeline:
-    """Reads, segments and writes scans at the same time.
+    """Reads, segments and writes scans at the same time, into files that `check_output` allows.
 
     Attributes:
         scans: the scans to segment.
         segment: segments scans that have been read.
         output: which files are written, and where.
-        taxonomy: the classes of the labels.
         batch: the number of scans that go through the networks together; it changes labels only by
             rounding.
         at_once: the number of batches that are segmented at the same time, each with its share of
             the threads.
         drives: the poses of the scans, if their scores are to be fused over time.
-        is_checked: whether the caller has called `check_output`. A run that resumes checks by
-            itself, because it may replace the files of the earlier run.
     """
 
     scans: Sequence[InputScan]
     segment: Segment
     output: OutputOptions
-    taxonomy: Taxonomy
     batch: int = 1
     at_once: int = 1
-    is_checked: bool = False
     drives: Drives | None = None
 
     def run(
@@ -132,17 +119,18 @@ class Pipeline:
             a line for each scan that is broken.
 
         Raises:
-            InputError: if two scans would have the same files, a scan and its output would have the
-                same folder, a file may not be written, or another run is writing into the folder.
+            InputError: if the run that is resumed had other settings, or another run is writing
+                into the folder.
         """
         folder = self.output.folder
         is_new = not folder.exists()
-        earlier = read_journals(folder, settings) if self.output.resume else {}
-        if self.output.resume or not self.is_checked:
-            check_output(self.scans, self.output, earlier)
-        done = self._still_done(earlier)
-        remaining = [scan for scan in self.scans if _key(scan) not in done]
-        kept = done if self.output.resume else self._entries_of_others(settings)
+        earlier = read_journals(folder)
+        changed = earlier.changed(settings)
+        if self.output.resume:
+            advice = "start over with --overwrite instead of --resume"
+            check_unchanged(folder, changed, advice)
+        kept = {} if changed else self._kept(earlier.entries)
+        remaining = [scan for scan in self.scans if _key(scan) not in kept]
 
         # Scans around the remaining ones are segmented again, if labels depend on them.
         segmented = remaining
@@ -173,35 +161,27 @@ class Pipeline:
                 folder.rmdir()
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
-    def _entries_of_others(self, settings: Mapping[str, Any]) -> dict[str, Entry]:
-        """Return the entries of an earlier run with equal settings that this run does not replace.
+    def _kept(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
+        """Return the entries of an earlier run with equal settings that stay in the journal.
 
-        They stay in the journal, so that a run over all scans can be resumed later.
+        The entries of other scans stay, so that a run over all scans can be resumed later. If the
+        run is resumed, scans that are still done stay too, and need not be segmented again.
         """
-        try:
-            earlier = read_journals(self.output.folder, settings)
-        except InputError:  # it had other settings
-            return {}
-        for scan in self.scans:
-            earlier.pop(_key(scan), None)
-        return earlier
-
-    def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
-        """Return the entries of an earlier run whose scans need not be segmented again.
-
-        The label files of such a scan exist. The scan has not changed, nor have the first scans of
-        its recording, which decide how it is normalised.
-        """
-        done = dict(earlier)
+        kept = dict(earlier)
         for scan in self.scans:
             entry = earlier.get(_key(scan))
-            if entry is None:
-                continue
-            paths = [self.output.folder / path for path in self.output.files_of(scan)]
-            is_same = entry.origin == self._origins[entry.scan]
-            if not is_same or not all(map(Path.is_file, paths)):
-                del done[entry.scan]
-        return done
+            if entry is not None and not (self.output.resume and self._is_done(scan, entry)):
+                del kept[entry.scan]
+        return kept
+
+    def _is_done(self, scan: InputScan, entry: Entry) -> bool:
+        """Return whether the files of a scan of an earlier run exist and are still right.
+
+        The scan has not changed, nor have the first scans of its recording, which decide how it is
+        normalised.
+        """
+        paths = [self.output.folder / path for path in self.output.files_of(scan)]
+        return entry.origin == self._origins[entry.scan] and all(map(Path.is_file, paths))
 
     @cached_property
     def _origins(self) -> dict[str, str]:
@@ -300,7 +280,7 @@ class Pipeline:
         if self.output.uncertain:
             write_uncertain(scores_path.with_suffix(UNCERTAIN_ENDING), result.uncertain)
 
-        scan.write_labels(folder, loaded, result, self.output.kind, self.taxonomy)
+        scan.write_labels(folder, loaded, result, self.output.kind)
 
         points = int(np.count_nonzero(loaded.scan.valid))
         uncertain = int(np.count_nonzero(result.uncertain))
@@ -325,15 +305,17 @@ def check_faults(faults: Sequence[str], total: int) -> None:
         )
 
 
-def check_output(
-    scans: Sequence[InputScan], output: OutputOptions, earlier: Mapping[str, Entry] | None = None
-) -> None:
-    """Raise InputError if a file of some scans may not be written.
+def check_output(scans: Sequence[InputScan], output: OutputOptions) -> None:
+    """Check that the files of some scans may be written; call this before any long work.
 
-    Args:
-        earlier: the entries of the run that is resumed, whose files may be replaced.
+    The files of the run that is resumed may be replaced.
+
+    Raises:
+        InputError: if two scans would have the same files, a scan and its output would have the
+            same folder, or a file may not be written.
     """
     folder = output.folder
+    earlier = read_journals(folder).entries if output.resume else {}
     _check_names(scans)
     inputs = list(output.also_read)
     own_files: list[Path] = []
@@ -341,7 +323,7 @@ def check_output(
     for scan in scans:
         inputs += scan.files
         for path, signature in output.files_of(scan).items():
-            if earlier is not None and _key(scan) in earlier:
+            if _key(scan) in earlier:
                 own_files.append(inside(folder, path))
             else:
                 new_files[inside(folder, path)] = signature

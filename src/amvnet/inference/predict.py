@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.drive import DriveChoice, Drives, find_poses, key_of
 from amvnet.inference.journal import Entry, describe_other_run
-from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import Pipeline, Segment, check_faults, check_output
+from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
+from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_faults, check_output
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
@@ -32,15 +31,11 @@ def predict(
     inputs: Sequence[str],
     request: LabellingRequest,
     make_segmenter: Callable[[], Segmenter],
-    folder: Path,
+    output: OutputOptions,
+    options: ScanOptions,
     *,
-    sequences: Sequence[str] | None = None,
-    split: str = "all",
     drive: DriveChoice | None = None,
     batch: int = 1,
-    overwrite: bool = False,
-    resume: bool = False,
-    also_read: Sequence[Path | str | None] = (),
     progress: Progress = no_progress,
     report: Reporter = report_nothing,
 ) -> int:
@@ -48,18 +43,16 @@ def predict(
 
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
-        request: how the scans are labelled, and which files are written for each.
+        request: how the scans are labelled, and which files are written for each; its precision is
+            not "auto", so that the journal says what the labels depend on.
         make_segmenter: returns the segmenter that computes the labels, with the weights, method and
             tau of the request. It is called after the inputs and the output are checked, because it
             may take long.
-        folder: the folder for the files.
-        sequences, split: which scans of datasets to use, as `ScanOptions` takes them.
+        output: the files of the request, and the folder for them.
+        options: which scans of the inputs to use.
         drive: how the scores of drives are fused over time; by default, each scan is segmented
             alone.
         batch: the number of scans that go through the networks together.
-        overwrite: replace files that exist.
-        resume: leave out the scans that an earlier run with an equal request has done.
-        also_read: other files that the command reads, which must not be replaced.
         progress: called with the number of scans that are done, and their total.
         report: takes lines about what was assumed of the sensor; at the end, if there are two
             networks, takes a line about how sure the labels are.
@@ -75,18 +68,9 @@ def predict(
     """
     classes = request.classes
     normaliser = Normaliser(request.weights.expects, request.sensor, report)
-    options = ScanOptions(sequences, split, request.topic, request.layout)
-    scans, taxonomy = list_inputs(inputs, options, request.weights.taxonomy, normaliser)
-    if classes is not None:
-        for scan in scans:
-            if isinstance(scan, DatasetScan):
-                scan.written = classes.target
-        taxonomy = classes.target
-
-    output = request.output(folder, overwrite=overwrite, resume=resume)
-    output = replace(output, also_read=also_read)
-    if not resume:  # the files of the earlier run are known only with the precision
-        check_output(scans, output)
+    written = None if classes is None else classes.target
+    scans, _ = list_inputs(inputs, options, request.weights.taxonomy, normaliser, written)
+    check_output(scans, output)
     drives = None
     if drive is not None:
         drives = find_poses(scans, drive.poses, drive.past_only, report=report)
@@ -94,20 +78,17 @@ def predict(
         drives = replace(drives, table=table)
         request = replace(request, drive=drives.digest)
     segmenter = make_segmenter()
-    request = replace(request, precision=segmenter.engine.precision)  # not "auto"
     pipeline = Pipeline(
         scans,
         segment_by(segmenter, classes, drives),
         output,
-        taxonomy,
         batch=batch,
         at_once=segmenter.at_once,
-        is_checked=not resume,
         drives=drives,
     )
-    if not resume:
+    if not output.resume:
         names = {str(scan.scores_path) for scan in scans}
-        other_run = describe_other_run(folder, request.settings, names)
+        other_run = describe_other_run(output.folder, request.settings, names)
         if other_run:
             report(f"warning: {other_run}")
     entries, faults = pipeline.run(request.settings, progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,15 +13,10 @@ from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.engines.compute import EngineName, Precision
 from amvnet.inference.pipeline import UNCERTAIN_ENDING, OutputOptions
 from amvnet.models.assertion import Disagreement
-from amvnet.models.methods import (
-    EngineName,
-    MethodName,
-    Precision,
-    check_method,
-    check_two_networks,
-)
+from amvnet.models.methods import MethodName, check_method, check_two_networks
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights
 
@@ -111,7 +107,13 @@ class LabellingRequest(Checked):
             "drive": self.drive,
         }
 
-    def output(self, folder: Path, overwrite: bool = False, resume: bool = False) -> OutputOptions:
+    def output(
+        self,
+        folder: Path,
+        overwrite: bool = False,
+        resume: bool = False,
+        also_read: Sequence[Path | str | None] = (),
+    ) -> OutputOptions:
         """Return which files are written for each scan, and into which folder."""
         return OutputOptions(
             folder,
@@ -120,4 +122,5 @@ class LabellingRequest(Checked):
             uncertain=self.uncertain,
             overwrite=overwrite,
             resume=resume,
+            also_read=also_read,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from amvnet.data.labels.writers import KINDS, SIGNATURES, write_scan_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import Scores
+from amvnet.models.methods import METHODS
 from amvnet.outputs import check_outputs
 from amvnet.scan import Scan
 
@@ -279,6 +281,37 @@ def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> 
         rv=None if scores.rv is None else expand_to_scan(scores.rv[points], valid),
         bev=None if scores.bev is None else expand_to_scan(scores.bev[points], valid),
     )
+
+
+def scores_by_method(
+    scores: Scores,
+    method: str,
+    names: Iterable[str],
+    vote: Callable[[Tensor], Tensor] | None = None,
+) -> dict[str, Tensor]:
+    """Return the scores (P, K) by a method and by the methods that it includes.
+
+    AMVNet and the ensembles include all ensembles and each single network.
+
+    Args:
+        scores: the scores by `method`.
+        names: the methods to return; methods that `method` does not include are left out.
+        vote: returns the scores by rv-knn, given the scores of the range view.
+    """
+    f = scores.rv
+    g = scores.bev
+    found: dict[str, Tensor | None] = {}
+    for name in names:
+        ensemble = METHODS[name].ensemble
+        if name == method:
+            found[name] = scores.merged
+        elif ensemble is not None:
+            found[name] = None if f is None or g is None else ensemble(f, g)
+        elif name == "rv-knn":
+            found[name] = None if f is None or vote is None else vote(f)
+        else:
+            found[name] = {"rv": f, "bev": g}.get(name)
+    return {name: values for name, values in found.items() if values is not None}
 
 
 def expand_to_scan(values: Tensor, valid: np.ndarray) -> np.ndarray:

@@ -7,11 +7,12 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from amvnet.data.formats.rows import UNKNOWN, RowLayout, parse_layout
+from amvnet.data.formats.find import list_scans
+from amvnet.data.formats.rows import parse_layout
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
-from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
+from amvnet.inference.listing import FileReader, InputScan, ScanOptions, list_inputs
 from amvnet.inference.reading import checked_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
@@ -33,17 +34,17 @@ class Segmenter:
     Args:
         weights: trained weights.
         engine: scores points by the networks of these weights.
-
-    Attributes:
-        weights, engine: as given.
         at_once: the number of scans to segment at the same time, each with its share of torch's
             threads; by default the number that the engine suggests.
+
+    Attributes:
+        weights, engine, at_once: as above.
     """
 
-    def __init__(self, weights: Weights, engine: Engine) -> None:
+    def __init__(self, weights: Weights, engine: Engine, at_once: int | None = None) -> None:
         self.weights = weights
         self.engine = engine
-        self.at_once = engine.at_once
+        self.at_once = engine.at_once if at_once is None else at_once
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -112,7 +113,9 @@ class Segmenter:
             scan = checked_scan(points, columns, self.weights.expects.intensity)
             return self._segment([scan], [yaw])[0]
 
-        scans, assumed = self._open(points, layout=parse_layout(columns))
+        normaliser, assumed = self._normaliser()
+        named = list_scans(points, layout=parse_layout(columns))
+        scans = FileReader(normaliser).scans(named, self.taxonomy)
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
@@ -169,24 +172,18 @@ class Segmenter:
             InputError: if there is no scan. The iterator raises it if a scan cannot be read or
                 segmented.
         """
-        scans, assumed = self._open(path, topic)
+        normaliser, assumed = self._normaliser()
+        options = ScanOptions(topic=topic)
+        scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
         return (self._segment_input(scan, assumed) for scan in scans)
 
-    def _open(
-        self, path: Path | str, topic: str | None = None, layout: RowLayout = UNKNOWN
-    ) -> tuple[Sequence[InputScan], list[str]]:
-        """Return the scans of a path, and a list.
-
-        When the scans are read, the list receives a line on what was assumed of their sensor.
-        """
+    def _normaliser(self) -> tuple[Normaliser, list[str]]:
+        """Return a normaliser, and the list of what it assumes of the sensors of the scans."""
         assumed: list[str] = []
-        normaliser = Normaliser(self.weights.expects, report=assumed.append)
-        options = ScanOptions(topic=topic, layout=layout)
-        scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
-        return scans, assumed
+        return Normaliser(self.weights.expects, report=assumed.append), assumed
 
     def _segment_input(self, scan: InputScan, assumed: list[str], yaw: float = 0.0) -> Segmentation:
-        """Read and segment one of the scans that `_open` returned."""
+        """Read and segment one of the scans for which a normaliser has `assumed` something."""
         loaded = scan.load(labels=True)
         result = self(loaded.scan, yaw=yaw)
 

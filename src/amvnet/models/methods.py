@@ -7,40 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal
 
-from amvnet.config.bounds import Count
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 MethodName = Literal["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
-# The floating-point type in which the two networks are computed.
-Precision = Literal["auto", "float32", "bfloat16", "float16"]
-EngineName = Literal["torch", "onnx", "int8"]  # name of the engine that runs the two networks
 # Takes the class probabilities f and g (P, K) of the two networks, and returns one (P, K).
 Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]
 
 
-@dataclass(frozen=True)
-class Compute:
-    """Where and how the networks are computed."""
-
-    device: str = "auto"
-    """device of the networks: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU."""
-    engine: EngineName = "torch"
-    """what runs the networks: torch, onnx (ONNX Runtime), or int8 (ONNX Runtime in 8-bit integers,
-    calibrated once; a few labels change)."""
-    precision: Precision = "auto"
-    """precision of the networks; auto: bfloat16 on a GPU, float32 on a CPU; float16 needs a GPU."""
-    at_once: Count | None = None
-    """number of scans segmented at the same time on a CPU; default: one per core, fewer if the
-    memory does not suffice."""
-
-
-ONNX_ENGINES = frozenset({"onnx", "int8"})  # engines that run ONNX Runtime
-PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 BOTH_NETWORKS = ("range_net", "polar_net")  # names of the two networks' parts in weights
 
 

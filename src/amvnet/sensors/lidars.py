@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from amvnet.config.yaml_files import read_yaml
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
-from amvnet.files import read_yaml
 
 # Heights of the sensors over the ground on the cars that recorded KITTI and nuScenes, metres.
 KNOWN_HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}

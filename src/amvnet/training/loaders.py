@@ -15,7 +15,7 @@ from amvnet.data.datasets.training_data import TrainingData
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.distributed import ALONE, Processes
-from amvnet.scan import Scan
+from amvnet.scan import Scan, check_trainable
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
@@ -107,13 +107,7 @@ class ScanSet(data.Dataset[Scan]):
             raise InputError(
                 f"{scan.name}: expected labels to train with, found none; name labelled sequences"
             )
-
-        valid = scan.valid.sum()
-        if valid < 2:  # batch norm needs two points to compute a variance
-            raise InputError(
-                f"{scan.name}: expected at least two valid points to train with, found {valid}; "
-                "leave the scan out"
-            )
+        check_trainable(scan)
         # Before the augmentation, which changes the order and the intensities of the points.
         return self.expects.prepare(scan)
 

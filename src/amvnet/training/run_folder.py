@@ -14,10 +14,11 @@ from typing import Any
 import yaml
 
 from amvnet.config.nested import flat, to_dict
+from amvnet.config.yaml_files import parse_yaml
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.training_data import TrainingData
 from amvnet.errors import InputError
-from amvnet.files import alone_in, atomic_write, parse_yaml, remove_unfinished
+from amvnet.files import alone_in, atomic_write, remove_unfinished
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.outputs import check_not_read
 from amvnet.training.expectation import NETWORK_OF

@@ -10,14 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmentation import Origin, Segmentation, expand_labels, expand_to_scan
+from amvnet.inference.segmentation import (
+    Origin,
+    Segmentation,
+    expand_labels,
+    expand_to_scan,
+    scores_by_method,
+)
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.amvnet import Scores
 from amvnet.models.assertion import cosine_similarity
-from amvnet.models.methods import geometric_mean
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import check_scan
 
@@ -79,7 +84,6 @@ def check_labels(labels: Path, count: int) -> None:
 
 def show_scans(
     scans: Sequence[InputScan],
-    taxonomy: Taxonomy,
     segmenter: Segmenter | None = None,
     labels: Path | None = None,
     progress: Progress = no_progress,
@@ -88,7 +92,6 @@ def show_scans(
 
     Args:
         scans: the scans.
-        taxonomy: the classes of the labels.
         segmenter: labels the scans; the labels of its networks are shown with its own.
         labels: without a segmenter, a folder of predictions as `predict` writes them, or the label
             file of a single scan.
@@ -112,7 +115,7 @@ def show_scans(
         if labels is None:
             return shown
 
-        ids = scan_input.read_labels(labels, len(scan), taxonomy)
+        ids = scan_input.read_labels(labels, len(scan))
         return replace(shown, labels={"labels": ids})
 
     at_once = 1 if segmenter is None else segmenter.at_once
@@ -131,14 +134,14 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
     """
     scan = origin.scan
     valid = torch.from_numpy(scan.valid)
-    scores: dict[str, Tensor] = {}  # (P, K) by method
-    for name, network in (("rv", result.rv), ("bev", result.bev)):
-        if network is not None:
-            scores[name] = torch.from_numpy(network)[valid]
-    has_two = len(scores) == 2
-    if has_two:
-        scores["ensemble"] = geometric_mean(scores["rv"], scores["bev"])
-    scores[origin.method] = torch.from_numpy(result.scores)[valid]
+    fetched = Scores(
+        merged=torch.from_numpy(result.scores)[valid],
+        uncertain=torch.from_numpy(result.uncertain)[valid],
+        rv=None if result.rv is None else torch.from_numpy(result.rv)[valid],
+        bev=None if result.bev is None else torch.from_numpy(result.bev)[valid],
+    )
+    names = dict.fromkeys(("rv", "bev", "ensemble", origin.method))
+    scores = scores_by_method(fetched, origin.method, names)
 
     labels = {}
     probabilities = {}
@@ -158,7 +161,7 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
         second=expand_to_scan(second[:, 1] + 1, scan.valid),
         second_probability=expand_to_scan(second_probability[:, 1], scan.valid),
     )
-    if not has_two:
+    if not result.has_two_networks:
         return shown
 
     similarity = cosine_similarity(scores["rv"], scores["bev"])

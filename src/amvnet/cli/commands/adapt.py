@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from amvnet.cli.console import on_terminal, progress, report
 from amvnet.cli.options import LabelledChoice, ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Count, Share
-from amvnet.models.methods import Compute
+from amvnet.engines.compute import Compute
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset

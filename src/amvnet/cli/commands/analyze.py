@@ -9,8 +9,8 @@ from typing import Annotated
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelledChoice, load_segmenter
 from amvnet.config.bounds import Range, Share
+from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.models.methods import Compute
 from amvnet.progress import counted
 
 Neighbours = Annotated[int, Range(1, 1000)]

@@ -8,7 +8,7 @@ from pathlib import Path
 from amvnet.cli.console import progress, show
 from amvnet.cli.options import WEIGHTS, load_segmenter
 from amvnet.config.bounds import Count, Share
-from amvnet.models.methods import Compute
+from amvnet.engines.compute import Compute
 
 
 def bench(

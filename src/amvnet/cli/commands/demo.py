@@ -55,7 +55,7 @@ def demo(
 
     scans, taxonomy = list_inputs([str(data)], taxonomy=segmenter.taxonomy)
     with progress("segmenting") as step:
-        shown = show_scans(scans, taxonomy, segmenter, progress=step)
+        shown = show_scans(scans, segmenter, progress=step)
         evaluation = write_page(page, shown, taxonomy, "Simulated streets")
     show_evaluation(evaluation, f"simulated streets, seed {seed}", metrics_path)
     report(f"labelled scans in {data}, scores in {metrics_path}; open {page} in a browser")

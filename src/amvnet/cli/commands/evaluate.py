@@ -11,15 +11,9 @@ from typing import TYPE_CHECKING
 from amvnet.cli.console import progress, report, show
 from amvnet.cli.options import DriveOptions, LabelledChoice, join_processes, load_segmenter
 from amvnet.config.bounds import Share
+from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.models.methods import (
-    PAPER_METHODS,
-    Compute,
-    MethodName,
-    check_method,
-    methods_of,
-    widest_method,
-)
+from amvnet.models.methods import PAPER_METHODS, MethodName, check_method, methods_of, widest_method
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord

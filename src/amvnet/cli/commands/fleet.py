@@ -5,8 +5,8 @@ from __future__ import annotations
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice
 from amvnet.config.bounds import Count
+from amvnet.engines.compute import Compute
 from amvnet.errors import import_optional
-from amvnet.models.methods import Compute
 from amvnet.progress import counted
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Range
-from amvnet.models.methods import Compute
+from amvnet.engines.compute import Compute
 from amvnet.progress import counted
 
 SHOWN_CLASSES = 4  # number of classes in the line about the map

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import DriveOptions, LabelChoice, ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Count
+from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.models.methods import Compute
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
@@ -46,13 +46,16 @@ def predict(
             only scans that are new or were not finished.
         overwrite: replace files that exist.
     """
+    from amvnet.engines.precision import resolved
     from amvnet.inference.predict import predict as predict_inputs
     from amvnet.weights.file import load
 
     for text in (*inputs, out):
         if "://" in text:
             raise InputError(f"{text}: expected a path, found a URL; use amvnet fleet")
+    compute = resolved(compute)  # the labels depend on what "auto" is
     request = labels.parse(load(weights), choice, sensor_choice, compute)
+    also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, time.poses)
 
     def make_segmenter() -> Segmenter:
         return load_segmenter(request.weights, request.method, compute, request.tau)
@@ -62,14 +65,10 @@ def predict(
             inputs,
             request,
             make_segmenter,
-            Path(out),
-            sequences=choice.sequences,
-            split=choice.split,
+            request.output(Path(out), overwrite, resume, also_read),
+            choice.parse(),
             drive=time.parse(),
             batch=batch,
-            overwrite=overwrite,
-            resume=resume,
-            also_read=(*inputs, weights, labels.classes, sensor_choice.sensor, time.poses),
             progress=step,
             report=report,
         )

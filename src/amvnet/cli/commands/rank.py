@@ -6,7 +6,7 @@ from pathlib import Path
 
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelledChoice, load_segmenter
-from amvnet.models.methods import Compute
+from amvnet.engines.compute import Compute
 from amvnet.progress import counted
 
 

@@ -7,8 +7,9 @@ from typing import Literal
 
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
+from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.models.methods import Compute, widest_method
+from amvnet.models.methods import widest_method
 from amvnet.progress import counted
 
 
@@ -81,7 +82,7 @@ def view(
         segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
     chosen = evenly_spaced(listed, scans)
     with place_for_page(html) as page, progress("looking") as step:
-        shown = show_scans(chosen, classes, segmenter, labels, progress=step)
+        shown = show_scans(chosen, segmenter, labels, progress=step)
         write_page(page, shown, classes, _title(inputs, weights))
     report(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")
     if html is None:

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from amvnet.config.yaml_files import read_yaml
 from amvnet.data.formats.rows import UNKNOWN, USUAL_TYPE, RowLayout
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
-from amvnet.files import read_yaml
 
 ENDINGS = (".yaml", ".yml")
 KEYS = (

@@ -179,7 +179,9 @@ class SimulatedStreets(Dataset):
                     indices, categories = scan.nuscenes_categories()
                     train_ids = [NUSCENES.raw_to_train[category] for category in categories]
                     labels = np.array(train_ids, dtype=np.uint8)[indices]
-                    yield Scan(_as_nuscenes(scan.points), labels, scan.ring)
+                    points = scan.nuscenes_points()
+                    points[:, 3] /= FULL_INTENSITY
+                    yield Scan(points, labels, scan.ring)
                 else:
                     labels = SEMANTICKITTI.to_train(scan.semantickitti_ids())
                     yield Scan(scan.points, labels, scan.ring)
@@ -206,13 +208,6 @@ def _write(folder: Path, scan: Scan) -> None:
     for name, array in arrays.items():
         if array is not None:
             np.save(folder / f"{name}.npy", array)
-
-
-def _as_nuscenes(points: np.ndarray) -> np.ndarray:
-    """Return points with nuScenes' axes and intensities in steps of 1/255."""
-    x, y, z, intensity = points.T
-    steps = np.round(intensity * FULL_INTENSITY)
-    return np.column_stack([-y, x, z, steps / FULL_INTENSITY]).astype(np.float32)
 
 
 def _put(part: Path, street: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from amvnet.cli.console import report, report_fault
-from amvnet.errors import without_secrets
+from amvnet.fleet.secrets import without_secrets
 
 from fixtures.growth import takes_linear_time
 
