@@ -312,8 +312,9 @@ class PlanOfTwo:
 
     recipe: Recipe
     out: Path
-    scans: Any
+    data: Any
     processes: Processes
+    stage: str | None = None
     report: Reporter = report_nothing
 
 
@@ -321,14 +322,15 @@ def test_ablate_scores_on_the_gpu_of_its_process(monkeypatch: pytest.MonkeyPatch
     devices = []
     evaluation = SimpleNamespace(matrices={"rv": np.ones((1, 20, 20))})
     monkeypatch.setattr(ablation, "choose_device", lambda name: "cuda")
-    monkeypatch.setattr(ablation, "train", lambda plan, stage: plan.out)
+    monkeypatch.setattr(ablation, "train", lambda plan: plan.out)
     monkeypatch.setattr(ablation, "load", lambda path, device, *_: devices.append(device))
     monkeypatch.setattr(ablation, "label_by_weights", lambda *_: None)
     monkeypatch.setattr(ablation, "evaluate", lambda *_, **options: evaluation)
 
-    scans = SimpleNamespace(dataset=SimpleNamespace(taxonomy=SEMANTICKITTI), val=[])
+    source = SimpleNamespace(dataset=SimpleNamespace(taxonomy=SEMANTICKITTI))
+    data = SimpleNamespace(sources=[source], val=[])
     second = Processes(rank=1, size=2, local_rank=1)
-    plan: Any = PlanOfTwo(Recipe(), Path("out"), scans, second)
+    plan: Any = PlanOfTwo(Recipe(), Path("out"), data, second)
     assert len(list(ablation.ablate(plan, "auto"))) == 4
     assert devices == ["cuda:1"] * 4
 

@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+from amvnet.data.datasets.open import is_dataset
 from amvnet.data.formats.find import list_scans
 from amvnet.data.formats.rows import parse_layout
 from amvnet.data.taxonomy import Taxonomy
@@ -113,6 +114,11 @@ class Segmenter:
             scan = checked_scan(points, columns, self.weights.expects.intensity)
             return self._segment([scan], [yaw])[0]
 
+        if is_dataset(str(points)):
+            raise InputError(
+                f"{points}: expected one scan, found a dataset; segment its scans with "
+                "Segmenter.each"
+            )
         normaliser, assumed = self._normaliser()
         named = list_scans(points, layout=parse_layout(columns))
         scans = FileReader(normaliser).scans(named, self.taxonomy)
