@@ -33,8 +33,9 @@ gpu: .venv/installed  ## on a machine with a GPU: its tests and its tables, to p
 	$(BIN)/python benchmarks/gpu.py $(SCAN)
 
 docs: .venv/docs docs/try/node_modules  ## the site of docs/, in site/
-	@echo "building the site of docs/ in site/: half a minute"
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "building the site of docs/ in site/: half a minute, or two minutes when networks have changed"
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "site/ is built; python -m http.server --directory site serves it at http://localhost:8000"
 
 style: .venv/installed
 	$(BIN)/ruff check src ros2 docker tests benchmarks docs .ci

@@ -2,9 +2,9 @@
 
     python docs/results.py
 
-Each page has its table between the lines `<!-- results -->` and `<!-- end of results -->`. Change
-figures only in docs/results.json, and run this. A test compares the tables of the pages, and the
-outputs of commands on them, with the file.
+Each table stands between the lines `<!-- NAME -->` and `<!-- end of NAME -->`. Change figures only
+in docs/results.json, and run this. A test compares the tables of the pages, and the outputs of
+commands on them, with the file.
 """
 
 from __future__ import annotations
@@ -16,25 +16,83 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs/results.json"
+PAGES = ("README.md", "docs/index.md", "docs/log.md", "docs/evaluation.md", "docs/finetuning.md")
 PRINTED_METHODS = ("rv", "bev", "plain", "ensemble", "amvnet", "drive")
-REGION = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.S)
+# The seven classes of the map `lidog`, in its order.
+SEVEN = ("vehicle", "person", "road", "sidewalk", "terrain", "man-made", "vegetation")
+TRUSTED = 60.0  # the least IoU of a class that can be trusted, percent
+CHECKED = 30.0  # the least IoU of a class whose points are worth checking, percent
+FEWEST_PLACES = 3  # a class in fewer places is not trusted, whatever its IoU
 
 
-def read() -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of the file, for the built-in weights and for fine-tuning."""
+def read() -> dict[str, Any]:
+    """Return the figures of the file."""
     figures = json.loads(FIGURES.read_text(encoding="utf-8"))
     assert isinstance(figures, dict)
     return figures
 
 
-def first_screen() -> str:
-    """Return the table of the rows that are marked `readme`."""
+def main_rows() -> str:
+    """Return the table of the rows that are marked `readme`, with all methods."""
     return table([row for row in read()["rows"] if row.get("readme")])
 
 
 def everything() -> str:
-    """Return the table of all rows."""
-    return table(read()["rows"])
+    """Return the table of all rows, each followed by its accuracy and its seven classes."""
+    rows = []
+    for row in read()["rows"]:
+        rows.append(row)
+        for key, title in (("accuracy", "accuracy"), ("seven", "seven classes")):
+            if key in row:
+                rows.append({"scans": f"the same, {title}", "weights": row["weights"], **row[key]})
+    return table(rows)
+
+
+def hidden() -> str:
+    """Return the table of the scans that decided nothing about the weights, for new users."""
+    lines = [
+        "| Scans | Points with the right label | mIoU, seven classes | mIoU, all classes |",
+        "|---|---|---|---|",
+    ]
+    for row in read()["rows"]:
+        if row.get("hidden"):
+            seven = f"{row['seven']['amvnet']:.1f}" if "seven" in row else ""
+            scans = row["scans"].replace(", hidden", "")
+            right = f"{row['accuracy']['amvnet']:.1f} %"
+            lines.append(f"| {scans} | {right} | {seven} | {row['amvnet']:.1f} |")
+    return "\n".join(lines)
+
+
+def trust() -> str:
+    """Return the table that says which classes can be trusted on real scans."""
+    datasets = read()["classes"]
+    bands: dict[str, list[str]] = {
+        f"**Trust**: IoU over {TRUSTED:g}": [],
+        f"**Check**: {CHECKED:g} to {TRUSTED:g}": [],
+        f"**Do not rely on**: under {CHECKED:g}, or in fewer than three places": [],
+    }
+    for classes in datasets.values():
+        chosen: list[list[str]] = [[], [], []]
+        for name, (iou, places) in sorted(classes.items(), key=lambda item: -item[1][0]):
+            is_rare = places < FEWEST_PLACES
+            band = 2 if is_rare or iou < CHECKED else 1 if iou < TRUSTED else 0
+            chosen[band].append(f"{name.replace('_', ' ')} {iou:.0f}")
+        for cells, names in zip(bands.values(), chosen, strict=True):
+            cells.append(", ".join(names))
+
+    lines = [f"| | {' | '.join(datasets)} |", f"|---{'|---' * len(datasets)}|"]
+    lines += [f"| {' | '.join([title, *cells])} |" for title, cells in bands.items()]
+    return "\n".join(lines)
+
+
+def seven_classes() -> str:
+    """Return the table of the IoU of AMVNet in each of the seven classes."""
+    lines = [f"| Scans | {' | '.join(SEVEN)} | mean |", f"|---{'|---' * (len(SEVEN) + 1)}|"]
+    for row in read()["rows"]:
+        if "seven_classes" in row:
+            figures = [*row["seven_classes"], row["seven"]["amvnet"]]
+            lines.append(f"| {row['scans']} | {' | '.join(f'{iou:.1f}' for iou in figures)} |")
+    return "\n".join(lines)
 
 
 def finetuning() -> str:
@@ -49,15 +107,6 @@ def finetuning() -> str:
             cells.append(f"{miou:.1f} ({accuracy:.1f})")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-# The table of each page.
-PAGES = {
-    "README.md": first_screen,
-    "docs/index.md": first_screen,
-    "docs/log.md": everything,
-    "docs/finetuning.md": finetuning,
-}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -80,19 +129,28 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def filled(page: str, text: str) -> str:
-    """Return the text of a page with the present table."""
-    new = PAGES[page]()
-    filled_text, count = REGION.subn(lambda match: f"{match[1]}{new}\n{match[2]}", text)
-    if count != 1:
-        raise ValueError(f"{page}: expected one pair of markers, found {count}")
-    return filled_text
+TABLES = {
+    "results": main_rows,
+    "all results": everything,
+    "hidden scans": hidden,
+    "trust": trust,
+    "seven classes": seven_classes,
+    "results of fine-tuning": finetuning,
+}
+
+
+def filled(text: str) -> str:
+    """Return the text of a page with the present tables."""
+    for name, write in TABLES.items():
+        region = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end of {name} -->)", re.S)
+        text = region.sub(rf"\g<1>{write()}\n\g<2>", text)
+    return text
 
 
 def main() -> None:
     for page in PAGES:
         path = ROOT / page
-        path.write_text(filled(page, path.read_text(encoding="utf-8")), encoding="utf-8")
+        path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

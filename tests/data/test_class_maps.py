@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
-from amvnet.data.class_maps import class_map
+from amvnet.data.class_maps import BUILT_IN, class_map
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.weights.file import save
 
 from fixtures.commands import fails, refusal, run_cli
 from fixtures.tiny import GOLDEN, fresh_weights, make_streets
 
-EQUAL = {  # classes of SemanticKITTI and of nuScenes that are the same coarse class
+EQUAL = {  # classes of SemanticKITTI and of nuScenes that each built-in map takes for the same
     "car": "car",
     "bicyclist": "bicycle",
     "person": "pedestrian",
@@ -35,11 +35,22 @@ def test_every_class_of_the_benchmarks_has_a_coarse_one(taxonomy: Taxonomy) -> N
     assert (table[1:] > 0).all()
 
 
-def test_the_same_things_are_the_same_coarse_class_in_both_benchmarks() -> None:
-    coarse = class_map("coarse")
+@pytest.mark.parametrize("built_in", BUILT_IN)
+def test_the_same_things_are_the_same_class_in_both_benchmarks(built_in: str) -> None:
+    mapping = class_map(built_in)
     for name, other in EQUAL.items():
-        train_id = coarse.table(SEMANTICKITTI)[SEMANTICKITTI.classes.index(name) + 1]
-        assert train_id == coarse.table(NUSCENES)[NUSCENES.classes.index(other) + 1], name
+        train_id = mapping.table(SEMANTICKITTI)[SEMANTICKITTI.classes.index(name) + 1]
+        assert train_id == mapping.table(NUSCENES)[NUSCENES.classes.index(other) + 1], name
+
+
+@pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES])
+def test_both_benchmarks_have_the_seven_classes_of_lidog_and_no_two_wheelers(
+    taxonomy: Taxonomy,
+) -> None:
+    table = class_map("lidog").table(taxonomy)
+    assert set(table.tolist()) == set(range(8))
+    for name, train_id in zip(taxonomy.classes, table[1:], strict=True):
+        assert not (name.endswith(("cycle", "cyclist")) and train_id), name
 
 
 def write_map(path: Path, classes: Any) -> Path:
@@ -96,7 +107,7 @@ def test_predict_writes_the_ids_of_the_map_for_datasets_and_files(tmp_path: Path
         np.testing.assert_array_equal(found, expected)
 
     message = refusal(f"predict {data} --weights {weights} --out {tmp_path / 'o'} --classes coars")
-    assert "expected coarse or a YAML file" in message
+    assert "expected coarse, lidog or a YAML file" in message
 
 
 def test_weights_of_one_benchmark_are_scored_on_the_other_by_coarse_classes(

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from amvnet.data.class_maps import class_map
+from amvnet.data.class_maps import BUILT_IN, class_map
 from amvnet.data.palette import DRAWN, UNCERTAIN, class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy
 
@@ -30,7 +30,9 @@ def distance(first: tuple[int, int, int], second: tuple[int, int, int]) -> float
     return float(np.linalg.norm(to_lab(first) - to_lab(second)))
 
 
-@pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES, class_map("coarse").target])
+@pytest.mark.parametrize(
+    "taxonomy", [SEMANTICKITTI, NUSCENES, *(class_map(name).target for name in BUILT_IN)]
+)
 def test_the_classes_and_uncertain_points_can_be_told_apart(taxonomy: Taxonomy) -> None:
     colors = class_colors(taxonomy)[1:]
     for first, second in combinations([*colors, UNCERTAIN], 2):

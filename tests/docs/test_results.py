@@ -9,6 +9,8 @@ from types import ModuleType
 
 import pytest
 
+from amvnet.data.class_maps import class_map
+
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 LOG = DOCS / "log.md"
@@ -27,10 +29,25 @@ def load_program() -> ModuleType:
 RESULTS = load_program()
 
 
-@pytest.mark.parametrize("page", list(RESULTS.PAGES))
-def test_a_page_has_the_table_of_the_file(page: str) -> None:
+@pytest.mark.parametrize("page", RESULTS.PAGES)
+def test_a_page_has_the_tables_of_the_file(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
-    assert RESULTS.filled(page, text) == text, "run python docs/results.py"
+    assert RESULTS.filled(text) == text, "run python docs/results.py"
+
+
+def test_every_table_is_on_a_page() -> None:
+    texts = "".join((ROOT / page).read_text(encoding="utf-8") for page in RESULTS.PAGES)
+    for name in RESULTS.TABLES:
+        assert texts.count(f"<!-- {name} -->\n") == texts.count(f"<!-- end of {name} -->") > 0, name
+    assert set(re.findall(r"<!-- end of (.*?) -->", texts)) == set(RESULTS.TABLES)
+
+
+def test_the_figures_of_seven_classes_have_the_means_that_are_stated() -> None:
+    assert class_map("lidog").target.classes == RESULTS.SEVEN
+    for row in RESULTS.read()["rows"]:
+        if "seven_classes" in row:
+            mean = sum(row["seven_classes"]) / 7
+            assert mean == pytest.approx(row["seven"]["amvnet"], abs=0.1), row["scans"]
 
 
 def test_what_evaluate_prints_in_the_pages_is_in_the_file() -> None:

@@ -202,7 +202,8 @@ class LabelChoice:
     format: FormatName = "label"
     """the format of the labels of scan files: raw ids (label, npy), or coloured points (ply)."""
     classes: str | None = None
-    """other classes, to which the classes of the weights are mapped: coarse, or a YAML file."""
+    """other classes, to which the classes of the weights are mapped: coarse, lidog, or a YAML
+    file."""
     scores: bool = False
     """also write the probabilities of both networks."""
     uncertain: bool = False

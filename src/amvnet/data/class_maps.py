@@ -14,7 +14,7 @@ from amvnet.config.yaml_files import parse_yaml, read_yaml
 from amvnet.data.taxonomy import Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, errors_of, shown
 
-COARSE_NAME = "coarse"
+BUILT_IN = ("coarse", "lidog")  # the maps in files of this package, by name
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,16 @@ class ClassMap:
 
 
 def class_map(name: str) -> ClassMap:
-    """Return the map `coarse` or the map in a YAML file; raise InputError if there is none."""
-    if name == COARSE_NAME:
-        text = (resources.files("amvnet.data") / "coarse.yaml").read_text(encoding="utf-8")
+    """Return a built-in map or the map in a YAML file; raise InputError if there is none."""
+    if name in BUILT_IN:
+        text = (resources.files("amvnet.data") / f"{name}.yaml").read_text(encoding="utf-8")
         return _parse(name, parse_yaml(text, name))
 
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(
-            f"--classes: expected {COARSE_NAME} or a YAML file, found {name!r}; give one of them"
+            f"--classes: expected {', '.join(BUILT_IN)} or a YAML file, found {name!r}; "
+            "give one of them"
         )
 
     with errors_of(path):

@@ -52,8 +52,8 @@ def evaluate(
             weights.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
-        classes: the classes to score instead of the dataset's: coarse, or a YAML file that maps the
-            classes of the data and of the weights to them.
+        classes: the classes to score instead of the dataset's: coarse, lidog, or a YAML file that
+            maps the classes of the data and of the weights to them.
         overwrite: replace figures and drawings that exist.
     """
     from amvnet.data.class_maps import class_map
