@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import importlib.util
 import json
 import os
 import shutil
@@ -30,6 +29,7 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import load, save
 
 from fixtures.browser_pages import CHROMIUM, FLAGS
+from fixtures.pages import load_script
 from fixtures.scan_writers import write_pcd
 from fixtures.sensors import LASERS, place
 from fixtures.tiny import fresh_weights
@@ -116,14 +116,8 @@ def served(folder: Path, headers: dict[str, str]) -> Iterator[Site]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> Path:
     """Build the page with tiny weights beside the built-in ones; return the folder around it."""
-    spec = importlib.util.spec_from_file_location("build_page", ROOT / "web" / "build.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-
     site = tmp_path_factory.mktemp("site")
-    module.build(site / "try")
+    load_script("web/build.py").build(site / "try")
 
     # As docs/deployment.md says.
     save(fresh_weights(), own_weights(site))
