@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -86,12 +85,6 @@ def test_the_exit_code_of_every_command(
             "resume" in inspect.signature(COMMANDS[command]).parameters
         )
         assert ("start it again" in error) == (command in CONTINUED_WHEN_REPEATED)
-
-
-def test_the_page_has_all_exit_codes() -> None:
-    page = (Path(__file__).parents[2] / "docs/command_line.md").read_text()
-    codes = re.findall(r"^\| (\d+) \|", page, re.M)
-    assert {int(code) for code in codes} == {code for _, code, _ in ENDS.values()}
 
 
 # The commands below sleep until a signal ends them. They sleep for short times, because Python
@@ -220,42 +213,6 @@ def test_a_stopped_predict_goes_on(
         patch.setattr(Journal, "add", add_and_stop)
         stopped = run_cli(*predict(world, tmp_path / "parts"), stops_itself=True)
     assert stopped == (143, "amvnet: stopped; go on with --resume\n")
-    check_it_goes_on(world, tmp_path)
-
-
-WAITING = """
-import sys, time
-from amvnet.__main__ import main
-from amvnet.inference.journal import Journal
-
-add = Journal.add
-added = []
-
-def add_and_wait(*arguments):
-    add(*arguments)
-    added.append(arguments)
-    if len(added) == {written}:
-        print("ready", flush=True)
-        while True:
-            time.sleep(0.1)
-
-Journal.add = add_and_wait
-sys.exit(main())
-"""
-
-
-@pytest.mark.full
-@pytest.mark.usefixtures("hears_sigint")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_process_that_is_stopped_goes_on(number: int, world: Path, tmp_path: Path) -> None:
-    script = WAITING.replace("{written}", str(WRITTEN))
-    words = predict(world, tmp_path / "parts")
-    with running("-c", script, *words) as process:
-        process.send_signal(number)
-        assert said_at_the_end(process) == (
-            STOPPED + number,
-            "amvnet: stopped; go on with --resume\n",
-        )
     check_it_goes_on(world, tmp_path)
 
 

@@ -6,7 +6,6 @@ import re
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
@@ -14,7 +13,6 @@ from amvnet.cli.main import COMMANDS, WITH_RECIPE
 from amvnet.cli.parser import Parser, make_parser
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
-from amvnet.engines.compute import EngineName
 
 from fixtures.pages import DocsPage
 
@@ -39,11 +37,6 @@ def test_every_command_can_be_parsed(page: str) -> None:
         if command.startswith("--") or arguments[-1:] in (["--help"], [HELP_ALL]):
             continue
         parser_of(command).values(arguments)
-
-
-def test_make_bench_asks_for_engines_that_there_are() -> None:
-    (engines,) = re.findall(r"--engines ([\w,]+)", (ROOT / "Makefile").read_text())
-    assert set(engines.split(",")) <= set(get_args(EngineName))
 
 
 def test_the_readme_names_every_extra() -> None:
