@@ -32,21 +32,21 @@ gpu: .venv/installed  ## on a machine with a GPU: its tests and its tables, to p
 	$(BIN)/python -m pytest -m gpu -rs
 	$(BIN)/python benchmarks/gpu.py $(SCAN)
 
-docs: .venv/docs docs/try/node_modules  ## the site of docs/, in site/
+docs: .venv/docs web/node_modules  ## the site of docs/, in site/
 	@echo "building the site of docs/ in site/: half a minute, or two minutes when networks have changed"
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "site/ is built; python -m http.server --directory site serves it at http://localhost:8000"
 
 style: .venv/installed
-	$(BIN)/ruff check src ros2 docker tests benchmarks docs .ci
-	$(BIN)/ruff format --check src ros2 docker tests benchmarks docs/*.py .ci
+	$(BIN)/ruff check src ros2 docker tests benchmarks docs web .ci
+	$(BIN)/ruff format --check src ros2 docker tests benchmarks docs/*.py web/*.py .ci
 
 lint: style  ## style and types
 	$(BIN)/mypy
 
 format: .venv/installed
-	$(BIN)/ruff check --fix src ros2 docker tests benchmarks docs .ci
-	$(BIN)/ruff format src ros2 docker tests benchmarks docs/*.py .ci
+	$(BIN)/ruff check --fix src ros2 docker tests benchmarks docs web .ci
+	$(BIN)/ruff format src ros2 docker tests benchmarks docs/*.py web/*.py .ci
 
 release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushing the tag publishes it
 	$(PYTHON) .ci/release.py $(VERSION)
@@ -71,9 +71,9 @@ release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushin
 	@$(PIP) --editable ".[docs]"
 	@touch $@
 
-# The packages that the page docs/try and its tests need. Without npm, the build reports that it leaves the page out.
-docs/try/node_modules: docs/try/package-lock.json
-	@if command -v npm > /dev/null; then echo "installing the packages of the page docs/try: a few seconds" && npm ci --prefix docs/try --ignore-scripts --no-audit --no-fund --silent; fi
+# The packages that the page try/ and its tests need. Without npm, the build reports that it leaves the page out.
+web/node_modules: web/package-lock.json
+	@if command -v npm > /dev/null; then echo "installing the packages of web/: a few seconds" && npm ci --prefix web --ignore-scripts --no-audit --no-fund --silent; fi
 
 clean:
-	rm -rf .venv demo site build docs/try/node_modules
+	rm -rf .venv demo site build web/node_modules

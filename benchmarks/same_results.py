@@ -10,11 +10,10 @@ adds real scans. Its FOLDER has semantickitti/ and nuscenes/ in the layout of th
 formats/ with scan files of other formats.
 
 `compare` prints the differences between two such folders, and their size if the files still exist.
-Then it counts the files with each kind of difference. It exits with 1 if there are any. Both
-folders must come from one machine, the same libraries and one version of this script: PYTHONPATH
-chooses the commit that is measured.
+It exits with 1 if there are any. Both folders must come from one machine, the same libraries and
+one version of this script: PYTHONPATH chooses the commit that is measured.
 
-`make` takes about eleven minutes on one core, and two of them are for the real scans.
+`make` takes about a quarter of an hour on one core, and two minutes more for the real scans.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ import argparse
 import base64
 import csv
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -32,17 +32,20 @@ import subprocess
 import sys
 import zipfile
 import zlib
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, get_args
 
 import numpy as np
 import yaml
 from safetensors import safe_open
 
-if TYPE_CHECKING:
-    from amvnet.models.methods import MethodName
+import amvnet
+from amvnet.cli.main import COMMANDS, WITH_RECIPE
+from amvnet.cli.options import FormatName
+from amvnet.config.recipes import recipe_names
+from amvnet.models.methods import MethodName
+from amvnet.weights.file import built_in
 
 DIGESTS = "digests.json"
 LOG = "log.txt"  # the file with the lines that the commands print
@@ -65,8 +68,6 @@ SETTINGS = {
     "COLUMNS": "10000",  # so that the help of each option is one line
     "PYTHONSAFEPATH": "1",  # so that no folder of OUT is taken for a package
 }
-
-METHODS: tuple[MethodName, ...] = ("rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet")
 
 # Networks of a few thousand parameters, every kind of augmentation, a head that learns from views.
 # They are based on the recipes of the paper, because the compact recipes change.
@@ -103,61 +104,65 @@ RECIPES = {
     ),
 }
 
-# Each line is a command of amvnet, run in OUT.
+# Each line is a command of amvnet, run in OUT. A line with {weights}, {method} or {format} is run
+# with each value that the package has; {methods} are all methods.
 COMMAND_LINES = """
 simulate city64 --sequences 3 --scans 1 --seed 5 --processes 1
 simulate city32 --sequences 3 --scans 2 --seed 6 --processes 1 --sensor hdl32e
+simulate street --sequences 1 --scans 6 --seed 9 --processes 1 --spacing 1
+check city64
+list
 
 # Labels of the built-in weights, by every method
-predict city64 --weights sim-hdl64e --scores --method rv --out labels/64/rv
-predict city64 --weights sim-hdl64e --scores --method bev --out labels/64/bev
-predict city64 --sequences 00 --weights sim-hdl64e --method arithmetic --out labels/64/arithmetic
-predict city64 --sequences 00 --weights sim-hdl64e --method maximum --out labels/64/maximum
-predict city64 --sequences 00 --weights sim-hdl64e --method ensemble --out labels/64/ensemble
-predict city64 --weights sim-hdl64e --scores --uncertain --out labels/64/amvnet
-predict city32 --weights sim-hdl32e --scores --uncertain --out labels/32/amvnet
-predict city32 --weights sim-hdl32e --method ensemble --batch 2 --out labels/32/batch
+predict city64 --weights sim-hdl64e --method {method} --scores --out labels/methods/{method}
+predict city64 --weights sim-hdl64e --scores --uncertain --out labels/64
+predict city32 --weights sim-hdl32e --scores --uncertain --out labels/32
+predict city32 --weights sim-hdl32e --method ensemble --batch 2 --out labels/batch
 predict city32 --sequences simulated-0000 --weights sim-hdl32e --precision bfloat16 --scores \
-    --out labels/32/bfloat16
+    --out labels/bfloat16
 
 # Lone scans: each format of labels; a sensor that is measured, named and described
-predict city64/sequences/00/velodyne --weights sim-hdl64e --uncertain --out lone/label
-predict city64/sequences/00/velodyne --weights sim-hdl64e --format ply --out lone/ply
+predict city64/sequences/00/velodyne --weights {weights} --format {format} --uncertain \
+    --out lone/{weights}/{format}
 predict city64/sequences/00/velodyne --weights sim-hdl64e --format npy --uncertain \
     --sensor os1-64 --height 1.2 --out lone/sensor
 predict city64/sequences/00/velodyne --weights sim-hdl64e --format npy --axes y-forward \
     --rotate 0,5,0 --offset 0.5,0,0.1 --intensity-scale 2 --out lone/frame
-predict city64/sequences/00/velodyne --weights sim-hdl32e --format npy --out lone/npy
+fleet city64/sequences/00/velodyne --weights sim-hdl64e --workers 1 --out labels/fleet
+
+# Drives
+predict street --weights sim-hdl64e --drive --out labels/drive
+map street --weights sim-hdl64e --out map.las --json figures/map.json
 
 # Figures and pictures
-evaluate city64 --split all --weights sim-hdl64e --json figures/64.json \
-    --methods rv,bev,arithmetic,maximum,ensemble,amvnet
+evaluate city64 --split all --weights sim-hdl64e --json figures/64.json --methods {methods}
 evaluate city32 --sequences simulated-0000 --weights sim-hdl32e --json figures/32.json \
-    --pictures figures/32 --methods rv,bev,arithmetic,maximum,ensemble,amvnet
-evaluate city64 --split all --predictions labels/64/amvnet --json figures/files.json
+    --pictures figures/32 --methods {methods}
+evaluate city64 --split all --predictions labels/64 --json figures/files.json
 analyze city64 --split all --weights sim-hdl64e --out figures/analysis
 
 # Two models' scores
-fuse city64 --scores-a labels/64/rv --scores-b labels/64/bev --out fused/ensemble
-fuse city64 --scores-a labels/64/amvnet --scores-b labels/64/amvnet \
-    --head sim-hdl64e --tau 0.7 --out fused/head
+fuse city64 --scores-a labels/methods/rv --scores-b labels/methods/bev --out fused/ensemble
+fuse city64 --scores-a labels/64 --scores-b labels/64 --head sim-hdl64e --tau 0.7 --out fused/head
 rank city32 --weights sim-hdl32e --out rank/suspects.csv
 
 # What others read
 view city64 --weights sim-hdl64e --scans 2 --html pages/weights.html
-view city32 --labels labels/32/amvnet --scans 2 --html pages/labels.html
-submit city64 --sequences 00 --predictions labels/64/amvnet --out archives/64.zip
-submit city32 --sequences simulated-0000 --predictions labels/32/amvnet --use-external \
+view city32 --labels labels/32 --scans 2 --html pages/labels.html
+submit city64 --sequences 00 --predictions labels/64 --out archives/64.zip
+submit city32 --sequences simulated-0000 --predictions labels/32 --use-external \
     --out archives/32.zip
 
 # Training
 train kitti.yaml --data city64 --out runs/kitti --train-sequences 00,01 --val-sequences 02
 train nuscenes.yaml --data city32 --out runs/nuscenes --training.workers 1
 train kitti.yaml --data city64 --out runs/tau --stage head --init runs/kitti \
-    --train-sequences 00,01 --val-sequences 02 \
-    --model.assertion.threshold 0.8
+    --train-sequences 00,01 --val-sequences 02 --model.assertion.threshold 0.8
 train kitti.yaml --data city64 --out runs/scores --stage head --with-val \
-    --scores-a labels/64/amvnet --scores-b labels/64/amvnet
+    --scores-a labels/64 --scores-b labels/64
+train finetune --data city64 --out runs/finetune --init runs/kitti --train-sequences 00 \
+    --val-sequences 02 --training.rv.epochs 1 --training.bev.epochs 1 --training.workers 0
+adapt street --weights runs/kitti --out runs/adapted --epochs 1 --streets 0
 ablate nuscenes.yaml --data city32 --out runs/ablation --training.rv.epochs 1
 analyze city64 --sequences 02 --weights runs/kitti --out runs/analysis --neighbours 2 \
     --recipe kitti.yaml --train-sequences 00,01
@@ -165,27 +170,17 @@ predict city64 --sequences 02 --weights runs/kitti --scores --uncertain --out la
 predict city64 --sequences 02 --weights runs/kitti --engine onnx --out labels/onnx
 
 # Graphs
-export --weights sim-hdl64e --out graphs/64
-export --weights sim-hdl64e --out graphs/64-int8 --int8 city64
-export --weights sim-hdl32e --out graphs/32
+export --weights {weights} --out graphs/{weights}
+export --weights sim-hdl64e --out graphs/int8 --int8 city64
 """
 REAL_COMMAND_LINES = f"""
 predict {REAL}/semantickitti --weights sim-hdl64e --out real-labels/kitti
 predict {REAL}/nuscenes --weights sim-hdl32e --scores --uncertain --out real-labels/nuscenes
-predict {REAL}/formats --weights sim-hdl64e --scores --uncertain --out real-labels/formats64
-predict {REAL}/formats --weights sim-hdl32e --scores --uncertain --out real-labels/formats32
+predict {REAL}/formats --weights {{weights}} --scores --uncertain --out real-labels/{{weights}}
 evaluate {REAL}/semantickitti --split all --predictions real-labels/kitti --json figures/kitti.json
 """
-
-# The help of each command, and the help of `train` with each recipe, give options and defaults.
-COMMANDS = (
-    *("demo", "simulate", "train", "predict", "evaluate", "submit", "fuse", "rank"),
-    *("analyze", "ablate", "export", "view", "bench", "info"),
-)
-BUILT_IN_RECIPES = (
-    *("semantickitti", "semantickitti-compact", "nuscenes", "nuscenes-compact"),
-    *("simulated", "simulated-compact", "simulated-hdl32e-compact"),
-)
+METHODS = get_args(MethodName)
+VALUES = {"weights": tuple(built_in()), "method": METHODS, "format": get_args(FormatName)}
 
 Part = np.ndarray | str
 
@@ -229,7 +224,7 @@ def make(out: Path, real: Path | None) -> None:
         (out / name).write_text(text)
 
     run = Runner(out)
-    print(f"measuring {run.installed()}")
+    print(f"measuring {amvnet.__file__}")
     save_help(run, out / "help")
     for words in words_of_lines(COMMAND_LINES + (REAL_COMMAND_LINES if real else "")):
         run("-m", "amvnet", *words)
@@ -246,18 +241,19 @@ def make(out: Path, real: Path | None) -> None:
 def save_help(run: Runner, folder: Path) -> None:
     """Write what `--help` prints, a file for each command and for each recipe."""
     folder.mkdir()
-    for command in COMMANDS:
-        (folder / f"{command}.help").write_text(run("-m", "amvnet", command, "--help"))
-    for recipe in BUILT_IN_RECIPES:
-        text = run("-m", "amvnet", "train", recipe, "--help")
-        (folder / f"train-{recipe}.help").write_text(text)
+    commands = [(name,) for name in COMMANDS]
+    for words in (*commands, *itertools.product(WITH_RECIPE[:1], recipe_names())):
+        (folder / f"{'-'.join(words)}.help").write_text(run("-m", "amvnet", *words, "--help"))
 
 
 def words_of_lines(text: str) -> Iterator[list[str]]:
-    """Yield the words of each line, without comments; lines that end in a backslash go on."""
+    """Yield the words of each line with each value; lines that end in a backslash go on."""
     for line in text.replace("\\\n", " ").splitlines():
-        if words := shlex.split(line, comments=True):
-            yield words
+        names = [name for name in VALUES if f"{{{name}}}" in line]
+        for values in itertools.product(*(VALUES[name] for name in names)):
+            named = dict(zip(names, values, strict=True))
+            if words := shlex.split(line.format(**named, methods=",".join(METHODS)), comments=True):
+                yield words
 
 
 class Runner:
@@ -298,11 +294,6 @@ class Runner:
             print(f"exit code {done.returncode}:\n{tail}", flush=True)
         return done.stdout
 
-    def installed(self) -> str:
-        """Return the path of the package that is measured."""
-        command = (sys.executable, "-c", "import amvnet; print(amvnet.__file__)")
-        return subprocess.check_output(command, env=self.environment, text=True).strip()
-
 
 def cpu_seconds() -> float:
     """Return the CPU time of the programs so far. Other programs do not affect it."""
@@ -312,8 +303,6 @@ def cpu_seconds() -> float:
 
 def use_library() -> None:
     """Save the results of the public functions in the folder `library`."""
-    import amvnet  # only here, because `make` and `compare` do not need it
-
     folder = Path("library")
     folder.mkdir()
     amvnet.simulate(folder / "city", sensor="hdl32e", sequences=2, scans=1, seed=7, processes=2)
@@ -519,34 +508,20 @@ def compare(before: Path, after: Path) -> int:
     new = json.loads((after / DIGESTS).read_text())
     paths = sorted(old.keys() | new.keys())
     differing = 0
-    kinds: Counter[str] = Counter()
 
     for path in paths:
         found: list[tuple[str, str]] = []
         if path not in old or path not in new:
-            side = "first" if path in old else "second"
-            found = [(f"a file {Path(path).suffix or Path(path).name}", f"is only in the {side}")]
+            found = [("", f"is only in the {'first' if path in old else 'second'}")]
         elif old[path] != new[path]:
             found = list(differences(old[path], new[path], before / path, after / path))
 
         differing += bool(found)
         for name, difference in found:
             print(f"{path}: {name} {difference}")
-        kinds.update({kind(name, difference) for name, difference in found})
 
-    print()
-    for text, count in kinds.most_common():
-        print(f"{count:4} files: {text}")
     print(f"{differing} of {len(paths)} files differ")
     return 1 if differing else 0
-
-
-def kind(name: str, difference: str) -> str:
-    """Describe a difference without its size. Entries and tensors of one name are of one kind."""
-    last_names = ".".join(name.split(".")[-2:])
-    if difference.startswith("differs"):
-        return f"{last_names} differs"
-    return f"{last_names} {difference}"
 
 
 def differences(

@@ -20,7 +20,6 @@ from amvnet.config.schema import ModelConfig, PointHeadConfig, Recipe
 from amvnet.errors import InputError
 
 from fixtures.commands import run_cli
-from fixtures.marks import with_quick
 
 
 def write_recipe(folder: Path, text: str) -> str:
@@ -49,13 +48,6 @@ def test_a_recipe_survives_the_way_to_json_and_yaml_and_back(name: str) -> None:
     assert from_dict(Recipe, json.loads(json.dumps(tree))) == recipe
     assert from_dict(Recipe, yaml.safe_load(yaml.safe_dump(tree))) == recipe
     assert from_dict(ModelConfig, tree["model"]) == recipe.model
-
-
-def test_every_builtin_recipe_is_there() -> None:
-    full_size = {"semantickitti", "nuscenes", "simulated"}
-    compact = {f"{name}-compact" for name in full_size} | {"simulated-hdl32e-compact"}
-
-    assert set(recipe_names()) == full_size | compact | {"finetune", "adapt"}
 
 
 def test_the_semantickitti_recipe_holds_the_papers_numbers() -> None:
@@ -95,12 +87,6 @@ def test_the_nuscenes_recipe_holds_the_papers_numbers() -> None:
     assert (training.bev.epochs, training.bev.batch) == (40, 8)
 
 
-@pytest.mark.parametrize("name", recipe_names())
-def test_a_recipes_stages_fit_each_other(name: str) -> None:
-    net = load_recipe(name).model.range_net
-    assert len(net.widths) == len(net.blocks) == len(net.height_strides)
-
-
 @pytest.mark.parametrize("recipe", ["semantickitti", "nuscenes"])
 @pytest.mark.parametrize("size", ["", "-compact"])
 def test_the_recipes_of_the_benchmarks_have_the_papers_head(recipe: str, size: str) -> None:
@@ -128,6 +114,7 @@ def test_an_empty_tree_gives_the_defaults() -> None:
         ("model: {range_net: {gru: 1}}", "gru"),
         ("model: {range_net: {widths: 64}}", "widths"),
         ("model: {range_net: {widths: [64, wide]}}", "widths"),
+        ("model: {range_net: {widths: [true, false]}}", "widths"),
         ("model: {range_net: 3}", "range_net"),
         ("model:", "model"),
         ("taxonomy: cityscapes", "taxonomy.*cityscapes"),
@@ -154,15 +141,13 @@ def test_an_unknown_recipe_is_an_input_error_that_lists_the_known_ones() -> None
         load_recipe("kitti")
 
 
-@pytest.mark.parametrize("base", ["nothing-like-it", "3", "[nuscenes]", "{a: 1}"])
-def test_a_base_that_is_not_a_recipe_is_an_input_error(tmp_path: Path, base: str) -> None:
+@pytest.mark.parametrize("base", ["nothing-like-it", "3", "[nuscenes]", "{a: 1}", "mine.yaml"])
+def test_a_base_that_is_no_other_recipe_is_an_input_error(
+    tmp_path: Path, base: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError):
-        load_recipe(write_recipe(tmp_path, f"base: {base}"))
-
-
-def test_a_recipe_that_is_its_own_base_is_an_input_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError):
-        load_recipe(write_recipe(tmp_path, f"base: {tmp_path / 'mine.yaml'}"))
+        load_recipe(write_recipe(Path(), f"base: {base}"))
 
 
 def test_a_binary_file_is_an_input_error(tmp_path: Path) -> None:
@@ -170,11 +155,6 @@ def test_a_binary_file_is_an_input_error(tmp_path: Path) -> None:
     path.write_bytes(bytes(range(256)))
     with pytest.raises(InputError, match=r"scan\.bin"):
         load_recipe(str(path))
-
-
-def test_a_list_of_booleans_is_not_a_list_of_numbers(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="widths"):
-        load_recipe(write_recipe(tmp_path, "model: {range_net: {widths: [true, false]}}"))
 
 
 @pytest.mark.parametrize("base", ["nuscenes-compact", "semantickitti"])
@@ -259,42 +239,8 @@ def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("assertion name", "entropy"),
-        ("assertion others", ["margin"]),
-        ("assertion other_thresholds", [0.1]),
-        ("point_head pooling", "attention"),
-        ("point_head heads", 2),
-    ],
+    ("option", "value"), [("training.rv.lr", "1e308"), ("training.head.points", 10**30)]
 )
-def test_a_removed_option_is_refused_like_any_unknown_key(field: str, value: Any) -> None:
-    part, name = field.split()
-    with pytest.raises(InputError, match=f"{part}: expected one of .* found '{name}'"):
-        from_dict(ModelConfig, {part: {name: value}})
-
-
-ABSURD = [
-    ("training.rv.lr", "1e308"),
-    ("training.head.lr", "1e308"),
-    ("training.rv.epochs", 10**30),
-    ("training.bev.batch", 10**30),
-    ("training.rv.clip", "1e308"),
-    ("training.bev.weight_decay", "1e308"),
-    ("training.rv.region", "1e308"),
-    ("training.rv.accumulate", 10**30),
-    ("training.head.views", 10**30),
-    ("training.head.points", 10**30),
-    ("training.head.drawn", 10**30),
-    ("training.workers", 10**12),
-    ("training.augment.jitter", "1e308"),
-    ("training.augment.yaw", "1e308"),
-    ("training.augment.height", "1e308"),
-    ("model.point_head.position_scale", "1e308"),
-]
-
-
-@pytest.mark.parametrize(("option", "value"), with_quick(ABSURD, [ABSURD[0], ABSURD[-1]]))
 def test_absurd_values_are_refused_before_a_folder_is_made(
     tmp_path: Path, option: str, value: object
 ) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import bz2
-import json
 import sqlite3
 import struct
-import subprocess
 import sys
 import zlib
 from collections.abc import Callable
@@ -25,40 +23,13 @@ from amvnet.data.formats import reader_process
 from amvnet.data.formats.find import list_scans
 from amvnet.errors import InputError
 
+from fixtures.marks import with_quick
 from fixtures.memory import memory_below
 from fixtures.scan_writers import some_points, write_bag1, write_bag2, write_las
 
 LARGEST_FILE = 15_000_000  # bytes of a file
 MEMORY = 1 << 30  # bytes
-SECONDS = 300  # of the processor: no bomb needs so many, but without an end they would take all
 TOO_LONG = "takes too long"
-
-READ = r"""
-import json, re, resource, sys
-from pathlib import Path
-from amvnet.data.class_maps import class_map
-from amvnet.data.formats import reader_process
-from amvnet.data.formats.find import list_scans
-
-kind, path, seconds, memory = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-reader_process.SECONDS = float(sys.argv[5])
-resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
-message = ""
-try:
-    if kind == "classes":
-        class_map(path)
-    else:
-        for scan in list_scans(path):
-            scan.read().to_scan()
-except ValueError as error:
-    message = str(error)
-reader_process._stop()
-reader = resource.getrusage(resource.RUSAGE_CHILDREN)
-(peak,) = re.findall(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
-print(json.dumps({"message": message, "bytes": 1024 * max(int(peak), reader.ru_maxrss)}))
-"""
-
 
 # --- packed zeros ---
 
@@ -345,8 +316,8 @@ def allowed_seconds(name: str) -> float:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
-@pytest.mark.parametrize("name", QUICK)
-def test_a_bomb_of_each_kind_is_read_or_refused_in_little_memory(
+@pytest.mark.parametrize("name", with_quick(BOMBS, QUICK))
+def test_a_bomb_is_read_or_refused_in_little_memory(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reader_process, "SECONDS", allowed_seconds(name))
@@ -362,23 +333,3 @@ def test_a_bomb_of_each_kind_is_read_or_refused_in_little_memory(
         except InputError as error:
             message = str(error)
     check_message(name, message)
-
-
-@pytest.mark.full
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
-@pytest.mark.parametrize("name", BOMBS)
-def test_a_bomb_is_read_or_refused_in_little_memory(name: str, tmp_path: Path) -> None:
-    """Each is read by a process of its own, which the operating system ends at the limits."""
-    path = write_bomb(name, tmp_path)
-    limits = (SECONDS, MEMORY, allowed_seconds(name))
-    process = subprocess.run(
-        [sys.executable, "-c", READ, BOMBS[name][0], str(path), *map(str, limits)],
-        capture_output=True,
-        text=True,
-    )
-    assert process.returncode == 0, process.stderr
-    usage = json.loads(process.stdout)
-    print(f"{name}: {usage['bytes'] / 1e6:.0f} MB, {usage['message']}")
-
-    assert usage["bytes"] < MEMORY
-    check_message(name, usage["message"])

@@ -47,13 +47,6 @@ def test_a_bag_of_other_messages_says_how_they_become_clouds(tmp_path: Path) -> 
     fails(lambda: list(list_scans(path, "/points")), "/points", *words)
 
 
-def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(b"LASF\0\0")
-    monkeypatch.setitem(sys.modules, "laspy", None)
-    fails(lambda: read_cloud(path), path, 'pip install "amvnet[formats]"')
-
-
 @pytest.mark.parametrize("name", ["a.parquet", "a.pkl", "a.pcap"])
 def test_formats_that_are_not_read_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / name

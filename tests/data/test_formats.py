@@ -9,8 +9,6 @@ import os
 import struct
 import sys
 import tracemalloc
-import warnings
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,6 @@ from pypcd4 import Encoding, PointCloud
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
-from amvnet.data.formats import reader_process
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.cloud import MAX_POINTS
 from amvnet.data.formats.find import find_scans, list_scans, read_cloud, scan_stem
@@ -202,20 +199,6 @@ def test_ascii_is_read_with_any_white_space_and_nan(tmp_path: Path) -> None:
     scan = read_scan(path)
     assert scan.points[[0, 1, 3]].tolist() == [[1, 2, 3, 0.5], [4, 5, 6, 1], [-1, 0.5, 2, 0]]
     assert scan.valid.tolist() == [True, True, False, True]
-
-
-def test_compressed_columns_of_several_values_are_read_as_pcl_writes_them(tmp_path: Path) -> None:
-    points = some_points()
-    normals = np.arange(180, dtype=np.float32)  # three per point, before x
-    data = normals.tobytes() + points.T.tobytes()
-    packed = lzf.compress(data, 2 * len(data))
-
-    header = "FIELDS normal x y z intensity\nSIZE 4 4 4 4 4\nTYPE F F F F F\nCOUNT 3 1 1 1 1\n"
-    header += "POINTS 60\nDATA binary_compressed\n"
-    sizes = struct.pack("<II", len(packed), len(data))
-    path = tmp_path / "a.pcd"
-    path.write_bytes(header.encode() + sizes + packed)
-    np.testing.assert_array_equal(read_scan(path).points, points)
 
 
 def test_the_first_value_of_a_column_of_several_is_used(tmp_path: Path) -> None:
@@ -593,16 +576,6 @@ def test_a_bag_is_read_in_constant_memory(tmp_path: Path) -> None:
 # --- missing packages, threads and false headers ---
 
 
-def test_the_warnings_of_the_process_are_left_alone_by_threads(folder: Path) -> None:
-    filters = list(warnings.filters)
-    with ThreadPoolExecutor(8) as threads:
-        for _ in threads.map(lambda name: read_scan(folder / name), [*WRITERS] * 5):
-            pass
-    assert warnings.filters == filters
-    with pytest.warns(UserWarning, match="still heard"):
-        warnings.warn("still heard", stacklevel=1)
-
-
 @pytest.mark.parametrize(
     ("missing", "name"), [("laspy", "old.las"), ("lazrs", "packed.laz"), ("rosbags", "plain.bag")]
 )
@@ -673,16 +646,6 @@ def test_headers_that_claim_billions_are_refused_before_memory_is_taken(
         assert peak < 20e6, (name, peak)
 
 
-@pytest.mark.full
-def test_a_file_that_claims_billions_of_records_is_refused_for_the_time_it_takes(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(reader_process, "SECONDS", 1.0)
-    path = tmp_path / "records.las"
-    path.write_bytes(_las(folder / "old.las", "<I", 100, MANY))
-    fails(partial(read_scan, path), path, "takes too long")
-
-
 def test_broken_compressed_files_give_an_error_of_one_line(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -747,10 +710,3 @@ def test_every_real_scan_is_read_alone_as_in_its_dataset(name: str, count: int) 
         assert (scan.ring is None) == (expected.ring is None)
         if scan.ring is not None:
             np.testing.assert_array_equal(scan.ring, expected.ring)
-
-
-def test_the_writers_agree_with_each_other(tmp_path: Path) -> None:
-    path = tmp_path / "a.pcd"
-    points = some_points()
-    path.write_bytes(pcd_bytes(points.view(FLOATS), FLOAT_FIELDS))
-    np.testing.assert_array_equal(PointCloud.from_path(path).numpy(), points)

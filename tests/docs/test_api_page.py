@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import re
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
 
 import amvnet
 from amvnet.cli.main import COMMANDS
 
-from fixtures.pages import DocsPage, execute
+from fixtures.pages import DocsPage, execute, load_script
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = DocsPage("docs/api.md")
-
-
-def load_hook() -> ModuleType:
-    """Import the hook of MkDocs, which is no part of a package."""
-    spec = spec_from_file_location("command_line_hook", DOCS / "command_line.py")
-    assert spec is not None
-    assert spec.loader is not None
-    hook = module_from_spec(spec)
-    spec.loader.exec_module(hook)
-    return hook
 
 
 def test_every_public_name_is_on_the_page() -> None:
@@ -47,7 +36,7 @@ def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_the_site_has_the_help_of_every_command() -> None:
-    hook = load_hook()
+    hook = load_script("docs/command_line.py")
     written = (DOCS / hook.PAGE).read_text(encoding="utf-8")
     page = SimpleNamespace(file=SimpleNamespace(src_uri=hook.PAGE))
     built = hook.on_page_markdown(written, page)

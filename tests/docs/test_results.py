@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 import re
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 from amvnet.data.class_maps import class_map
 
+from fixtures.pages import load_script
+
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 LOG = DOCS / "log.md"
-
-
-def load_program() -> ModuleType:
-    """Import docs/results.py, which is no part of a package."""
-    spec = spec_from_file_location("results_program", DOCS / "results.py")
-    assert spec is not None
-    assert spec.loader is not None
-    program = module_from_spec(spec)
-    spec.loader.exec_module(program)
-    return program
-
-
-RESULTS = load_program()
+RESULTS = load_script("docs/results.py")
 
 
 @pytest.mark.parametrize("page", RESULTS.PAGES)

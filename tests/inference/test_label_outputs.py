@@ -293,35 +293,11 @@ def test_one_network_alone_reports_no_uncertain_points(world: Path, tmp_path: Pa
     assert not (tmp_path / "other").exists()
 
 
-@pytest.mark.parametrize(
-    ("scan", "options"),
-    [("b.ply", ("--format", "ply")), ("a.bin", ("--format", "ply")), ("c.npz", ("--scores",))],
-)
-def test_scans_are_never_overwritten(
-    scan: str, options: tuple[str, ...], world: Path, tmp_path: Path
-) -> None:
-    points = some_points(400)
-    points.tofile(tmp_path / "a.bin")
-    (tmp_path / "a.ply").write_bytes(b"another scan of mine")
-    write_pcd(tmp_path / "b.ply", points, "binary")
-    np.savez(tmp_path / "c.npz", points=points)
-
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    message = failure(world, tmp_path, tmp_path / scan, *options)
-    assert "--out" in message
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
 def test_uncertain_points_next_to_scans_are_not_scans(world: Path, tmp_path: Path) -> None:
     some_points(400).tofile(tmp_path / "a.bin")
     for _ in range(2):
         assert predict(world, tmp_path, tmp_path, "--uncertain", "--overwrite")[0] == 0
     assert files(tmp_path) == {"a.bin", "a.label", "a.uncertain.npy"}
-
-
-def test_an_unknown_format_gives_an_error_of_one_line(world: Path, tmp_path: Path) -> None:
-    message = failure(world, tmp_path, world / "lone.bin", "--format", "xyz")
-    assert "ply" in message
 
 
 @pytest.mark.parametrize(("x", "kind"), [(400.0, "float"), (400_000.01, "double")])

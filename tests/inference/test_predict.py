@@ -17,7 +17,6 @@ import torch
 
 import amvnet
 from amvnet.cli.options import load_segmenter
-from amvnet.data.datasets.open import open_dataset
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -43,7 +42,6 @@ from fixtures.counted_scans import Counter, counted_scans
 from fixtures.datasets import MAKERS
 from fixtures.marks import with_full
 from fixtures.processes import PATIENCE, running
-from fixtures.scan_writers import WRITERS, some_points
 from fixtures.tiny import fresh_weights, make_streets, street
 from fixtures.world import SCANS
 
@@ -553,28 +551,6 @@ def test_predict_segments_as_many_scans_at_a_time_as_asked_or_as_there_are_threa
 
 
 # ---- scans that vanish, or cannot be read any more, after they were listed
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_a_vanished_scan_is_a_broken_one(name: str, tmp_path: Path) -> None:
-    path = tmp_path / name
-    WRITERS[name](path, some_points())
-    (scan,), _ = list_inputs([str(path)])
-    path.unlink()
-    fails(scan.load, path, "; ")
-
-
-@pytest.mark.parametrize("layout", MAKERS)
-@pytest.mark.parametrize("name", ["points_path", "labels_path"])
-def test_a_vanished_scan_of_a_dataset_is_a_broken_one(
-    layout: str, name: str, tmp_path: Path
-) -> None:
-    MAKERS[layout](tmp_path)
-    dataset = open_dataset(f"{layout}:{tmp_path}")
-    record = dataset.records(dataset.sequences("all"))[0]
-    path = getattr(record, name)
-    path.unlink()
-    fails(lambda: dataset.read(record), path, "; ")
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.ESTALE, errno.EIO, errno.ENOENT])

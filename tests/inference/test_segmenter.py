@@ -332,16 +332,6 @@ def test_each_method_has_its_own_scores(result: Segmentation) -> None:
         assert actual.uncertain.any() == (method == "ensemble")
 
 
-def test_by_method_is_what_each_method_gives_alone(segmenter: Segmenter) -> None:
-    labels, uncertain, _ = labels_by_method(segmenter, Scan(POINTS))
-    assert set(labels) == {"rv", "bev", "ensemble", "amvnet"}
-    for method in METHOD_NAMES:
-        if method in labels:
-            assert np.array_equal(labels[method], labels_by(method))
-    assert uncertain is not None
-    assert np.array_equal(uncertain, segmenter(POINTS).uncertain)
-
-
 def test_by_method_equals_each_method(segmenter: Segmenter) -> None:
     points, _ = with_lost_returns(POINTS)
     labels, uncertain, _ = labels_by_method(segmenter, Scan(points), METHOD_NAMES)
@@ -583,12 +573,6 @@ print({"torch", "lightning", "matplotlib", "scipy"} & set(sys.modules))
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert process.stdout.strip() == "set()"
-
-
-def test_every_exported_name_is_there() -> None:
-    for name in amvnet.__all__:
-        assert hasattr(amvnet, name)
-    assert not hasattr(amvnet, "nothing")
 
 
 PEAK = """

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NOTES = ROOT / ".ci/release_notes.py"
 AUTHOR = {
     f"GIT_{who}_{what}": "a@b.example"
@@ -42,16 +41,14 @@ def test_the_notes_are_the_part_on_the_version(tmp_path: Path) -> None:
 def test_a_tag_of_another_version_is_not_released(tmp_path: Path) -> None:
     make_project(tmp_path, "## [1.2.4] - 2026-01-02\n\n- this\n")
     result = run_notes(tmp_path, "v1.2.4")
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1)
 
 
-def test_a_version_without_a_dated_part_is_not_released(tmp_path: Path) -> None:
-    for changelog in ("## [Unreleased]\n\n- this\n", "## [1.2.3] - 2026-01-02\n\n## [1.2.2]\n"):
-        make_project(tmp_path, changelog)
-        result = run_notes(tmp_path, "v1.2.3")
-        assert result.returncode == 2
-        assert result.stderr.count("\n") == 1
+@pytest.mark.parametrize("changelog", ["## [Unreleased]\n\n- a\n", "## [1.2.3] - 2026-01-02\n"])
+def test_a_version_without_a_dated_part_is_not_released(changelog: str, tmp_path: Path) -> None:
+    make_project(tmp_path, changelog)
+    result = run_notes(tmp_path, "v1.2.3")
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1)
 
 
 def run_release(root: Path, version: str) -> subprocess.CompletedProcess[str]:
@@ -106,8 +103,3 @@ def test_a_release_that_is_refused_changes_nothing(tmp_path: Path) -> None:
     assert "commit" in result.stderr
     assert git(tmp_path, "log", "--format=%s") == "first\n"
     assert git(tmp_path, "diff") == git(tmp_path, "tag") == ""
-
-
-def test_the_changelog_has_a_part_on_the_version_after_an_unreleased_one() -> None:
-    headings = re.findall(r"(?m)^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text())
-    assert headings[:2] == ["Unreleased", PROJECT["version"]]

@@ -29,7 +29,7 @@ from amvnet_ros.messages import Message
 from fixtures.bag_poses import drive_clouds, drive_odometry, pose_at, write_bag
 from fixtures.commands import succeed
 from fixtures.processes import PATIENCE
-from fixtures.ros import STORE, FakeNode, install, over_the_wire
+from fixtures.ros import STORE, install, over_the_wire
 from fixtures.scan_writers import cloud_message, write_bag2
 from fixtures.tiny import street
 
@@ -470,10 +470,3 @@ def test_importing_the_node_does_not_import_torch() -> None:
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
-
-
-def test_the_stand_in_refuses_parameters_of_another_type(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, threads=1.5)
-    descriptor = SimpleNamespace(description="threads", read_only=True)
-    with pytest.raises(sys.modules["rclpy.exceptions"].ParameterException):
-        FakeNode("test").declare_parameter("threads", 0, descriptor)

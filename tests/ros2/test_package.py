@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import configparser
 import runpy
 import sys
 import tomllib
@@ -49,30 +48,6 @@ def test_both_manifests_agree_with_each_other_and_with_amvnet(
     assert text("description") == setup_arguments["description"]
     assert text("maintainer") == setup_arguments["maintainer"]
     assert text("export/build_type") == "ament_python"
-
-
-def test_every_file_that_is_installed_is_there(setup_arguments: dict[str, Any]) -> None:
-    installed = set()
-    for _, sources in setup_arguments["data_files"]:
-        installed |= set(sources)
-    for source in installed:
-        assert (PACKAGE / source).is_file(), source
-
-    for folder in ("launch", "config", "resource"):
-        for path in (PACKAGE / folder).iterdir():
-            assert str(path.relative_to(PACKAGE)) in installed
-
-
-def test_ros_finds_the_executable(setup_arguments: dict[str, Any]) -> None:
-    (script,) = setup_arguments["entry_points"]["console_scripts"]
-    assert script == "segment = amvnet_ros.node:main"
-    functions = ast.parse((PACKAGE / "amvnet_ros/node.py").read_text()).body
-    assert "main" in [node.name for node in functions if isinstance(node, ast.FunctionDef)]
-
-    config = configparser.ConfigParser()
-    config.read(PACKAGE / "setup.cfg")
-    assert config["install"]["install_scripts"] == "$base/lib/amvnet_ros"
-    assert config["develop"]["script_dir"] == "$base/lib/amvnet_ros"
 
 
 def test_the_manifest_names_every_package_that_is_imported() -> None:

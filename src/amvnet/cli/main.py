@@ -46,8 +46,6 @@ CONTINUED_WHEN_REPEATED = (
 WITH_PROCESSES = ("train", "evaluate", "ablate")  # commands whose work several processes can share
 WITH_RECIPE = ("train", "ablate")  # commands whose options are also the values of a recipe
 
-TRACKER_FILTER = "ignore:resource_tracker"  # a filter of warnings, as Python's option -W takes it
-
 # Exit codes.
 DONE = 0
 FAILED = 1
@@ -187,9 +185,7 @@ def _suppress_library_warnings() -> None:
     warnings.filterwarnings("ignore", module="lightning")
     warnings.filterwarnings("ignore", module="torch")
     # Python's process that tracks semaphores warns if a command was stopped at once.
-    filters = os.environ.get("PYTHONWARNINGS", "").split(",")
-    if TRACKER_FILTER not in filters:
-        os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [*filters, TRACKER_FILTER]))
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
 
 
 if __name__ == "__main__":

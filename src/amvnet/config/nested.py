@@ -69,7 +69,6 @@ def flat(tree: Any, name: str = "", depth: int = MAX_DEPTH) -> Iterator[tuple[st
     """Yield the keys and values of nested dictionaries; dots join the keys of several levels.
 
     Args:
-        tree: the nested dictionaries.
         name: the key of `tree` itself, if it is a part of a larger tree.
         depth: number of levels to follow. A dictionary on a deeper level is yielded as a value.
     """

@@ -12,8 +12,6 @@ from amvnet.errors import InputError, shown
 
 LARGEST_YAML = 50_000  # largest size of a YAML file, bytes; PyYAML takes a second for it
 DEEPEST_YAML = 50  # largest number of levels of nested values in a YAML file
-LONGEST_INTEGER = 40  # largest number of digits of a whole number in a YAML file
-INTEGER = "tag:yaml.org,2002:int"  # PyYAML's tag of whole numbers
 
 
 def read_yaml(path: Path, content: str) -> Any:
@@ -78,9 +76,8 @@ def _fault_of_yaml(error: Exception, text: str) -> str:
 class _BoundedLoader(yaml.SafeLoader):
     """PyYAML's safe loader without features that can take hours or unlimited memory.
 
-    The depth of values and the length of numbers are limited. Aliases are refused, because ten
-    lines with aliases can stand for billions of values. A key may not occur twice, because one of
-    its values would be lost.
+    The depth of values is limited. Aliases are refused, because ten lines with aliases can stand
+    for billions of values. A key may not occur twice, because one of its values would be lost.
     """
 
     def __init__(self, stream: str) -> None:
@@ -109,8 +106,3 @@ class _BoundedLoader(yaml.SafeLoader):
                 raise yaml.YAMLError(f"the key {shown(key)} twice")
             keys.add(key)
         return mapping
-
-    def construct_scalar(self, node: Any) -> Any:
-        if node.tag == INTEGER and len(node.value) > LONGEST_INTEGER:
-            raise yaml.YAMLError(f"a number of {len(node.value)} digits")
-        return super().construct_scalar(node)

@@ -49,7 +49,6 @@ class Trajectory:
 
         Args:
             times: the time of each scan, seconds, or None if the times are unknown.
-            count: the number of scans.
 
         Raises:
             InputError: if the file does not have a pose for each scan.
@@ -151,7 +150,6 @@ def timed_poses(name: str, table: NDArray[np.float64]) -> Trajectory:
 
     Args:
         name: the file or the topic, for messages.
-        table: the table.
 
     Raises:
         InputError: if there is no pose, a quaternion has not the length 1, a value is no number, or

@@ -115,7 +115,6 @@ def build_model(
         weights: trained weights.
         method: how the points are scored, one of `METHODS`.
         tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
-        device: the device for the parameters.
 
     Raises:
         InputError: if the weights lack a part that the method needs, there is no such method, or

@@ -46,8 +46,6 @@ class OnnxEngine(Engine):
     activations are unsigned.
 
     Args:
-        weights: the weights of the graphs.
-        networks: the graphs.
         method: how the points are scored, one of `METHODS`.
         tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
         int8: whether the graphs are in int8.

@@ -90,7 +90,6 @@ def export(
 
     Args:
         weights: trained weights, or the name or path of a weights file.
-        out: the folder.
         progress: called with the number of graphs that are done, and their total.
         int8: convert the convolutions to int8, calibrated with these scans: a dataset, scan files
             as `predict` takes them, or `simulated`. By default, the graphs are in float32.

@@ -76,7 +76,6 @@ def list_scans(inputs: Iterable[str], out: Place) -> Iterator[pa.Table]:
     Args:
         inputs: URLs or paths. Each names a scan file, a folder of scan files and folders, or a
             manifest, which is a Parquet or CSV file with a row for each scan.
-        out: the output folder.
 
     Raises:
         InputError: if an input cannot be reached, is a dataset, has no scan, or has files with

@@ -92,7 +92,6 @@ def label_fleet(
         inputs: the scans, as `list_scans` takes them.
         request: how the scans are labelled, and which files are written.
         out: the URL or the path of the output folder.
-        cluster: the workers.
         resume: continue an earlier run into the same folder.
         progress: called with the number of scans that are done, and their total so far.
         report: takes lines about what was assumed of the sensors, and how sure the labels are.
@@ -146,7 +145,6 @@ class FleetRun:
     Args:
         request: how the scans are labelled.
         results: the table of results; it knows the scans that an earlier run has done.
-        cluster: the workers.
         resources: the resources of each worker, as options of Ray.
         progress: called with the number of scans that are done, and their total so far.
         report: takes lines for the user.
@@ -280,8 +278,6 @@ class FleetRun:
 
         Args:
             kind: the class of the workers; a worker takes one block at a time.
-            arguments: the arguments of the class.
-            blocks: the tables.
             resources: the resources of each worker, as options of Ray.
             max_lost: the largest number of blocks that may be lost; -1 sets no limit.
 

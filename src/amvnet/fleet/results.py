@@ -79,7 +79,6 @@ class Results:
     removed, so that each scan has one row.
 
     Args:
-        out: the output folder.
         request: how the scans are labelled.
         resume: whether to continue an earlier run.
 
@@ -270,7 +269,6 @@ def describe_drive(drive: str, assumed: str, usual: Estimate | None) -> dict[str
     """Return the row of a drive in the table of drives, which all workers and later runs use.
 
     Args:
-        drive: the name of the drive.
         assumed: a line about what was assumed of the sensor.
         usual: the median of what the first scans show of the sensor; None if they cannot be read,
             or have several sensors.

@@ -20,7 +20,7 @@ COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 STEP_LENGTH = 0.2
 
 
-class Muon(torch.optim.AdamW):
+class Muon(torch.optim.Optimizer):
     """Muon for the kernels of the hidden layers, and AdamW for all other parameters.
 
     A few directions dominate the gradient of a kernel, so that a network learns the others slowly.
@@ -32,17 +32,15 @@ class Muon(torch.optim.AdamW):
         net: the network, whose parameters are in the order of its layers.
         lr: the learning rate of all parameters.
         weight_decay: the decoupled weight decay of all parameters.
-        fused: see `torch.optim.AdamW`.
     """
 
-    def __init__(
-        self, net: nn.Module, lr: float, weight_decay: float, fused: bool | None = None
-    ) -> None:
+    def __init__(self, net: nn.Module, lr: float, weight_decay: float) -> None:
         hidden = hidden_kernels(net)
         ids = set(map(id, hidden))
         others = [parameter for parameter in net.parameters() if id(parameter) not in ids]
-        groups = [{"params": others}, {"params": hidden}]
-        super().__init__(groups, lr=lr, weight_decay=weight_decay, fused=fused)
+        groups = [{"params": others, "is_hidden": False}, {"params": hidden, "is_hidden": True}]
+        defaults = {"lr": lr, "weight_decay": weight_decay, "betas": (0.9, 0.999), "eps": 1e-8}
+        super().__init__(groups, defaults)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -52,30 +50,42 @@ class Muon(torch.optim.AdamW):
             with torch.enable_grad():
                 loss = closure()
 
-        group = self.param_groups[1]
-        gradients = [parameter.grad for parameter in group["params"]]
-        for parameter in group["params"]:
-            parameter.grad = None  # AdamW leaves such parameters alone
-        super().step()
-
-        for parameter, gradient in zip(group["params"], gradients, strict=True):
-            parameter.grad = gradient
-            if gradient is not None:
-                self._move(parameter, gradient, group)
+        for group in self.param_groups:
+            move = self._move_hidden if group["is_hidden"] else self._move_other
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    parameter.mul_(1 - group["lr"] * group["weight_decay"])
+                    move(parameter, parameter.grad, group)
         return loss
 
-    def _move(self, kernel: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
+    def _move_hidden(self, kernel: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
         momentum = group["betas"][0]
         state = self.state[kernel]
         if not state:
-            state["step"] = torch.zeros(())  # AdamW looks for it in a state that is loaded
             state["average"] = torch.zeros_like(kernel)
         average = state["average"].lerp_(gradient, 1 - momentum)
 
         direction = gradient.lerp(average, momentum).flatten(1)  # Nesterov's momentum
         length = STEP_LENGTH * max(direction.shape) ** 0.5
-        kernel.mul_(1 - group["lr"] * group["weight_decay"])
         kernel.add_(orthogonal(direction).view_as(kernel), alpha=-group["lr"] * length)
+
+    def _move_other(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
+        """Move a parameter as `torch.optim.AdamW` does on a CPU, to the bit."""
+        beta, beta_of_squares = group["betas"]
+        state = self.state[parameter]
+        if not state:
+            state["step"] = 0
+            state["average"] = torch.zeros_like(parameter)
+            state["squares"] = torch.zeros_like(parameter)
+        state["step"] += 1
+        average = state["average"].lerp_(gradient, 1 - beta)
+        squares = state["squares"].mul_(beta_of_squares)
+        squares.addcmul_(gradient, gradient, value=1 - beta_of_squares)
+
+        # Both averages began at zero, so that they are too small in the first steps.
+        length = group["lr"] / (1 - beta ** state["step"])
+        root = (1 - beta_of_squares ** state["step"]) ** 0.5
+        parameter.addcdiv_(average, (squares.sqrt() / root).add_(group["eps"]), value=-length)
 
 
 def hidden_kernels(net: nn.Module) -> list[nn.Parameter]:

@@ -181,17 +181,16 @@ class NetworkStage(Stage):
         return weight
 
     def configure_optimizers(self) -> Any:
+        lr, weight_decay = self.config.lr, self.config.weight_decay
+        if self.config.optimizer == "muon":
+            return self.one_cycle(Muon(self.trained, lr, weight_decay))
+
         # On a GPU, a fused optimizer takes the whole step in one launch. With it, Lightning cannot
         # clip the scaled gradients of float16.
         is_fused = self.device.type == "cuda" and self.precision != HALF
-        options: dict[str, Any] = {
-            "lr": self.config.lr,
-            "weight_decay": self.config.weight_decay,
-            "fused": is_fused or None,
-        }
-        if self.config.optimizer == "muon":
-            return self.one_cycle(Muon(self.trained, **options))
-        return self.one_cycle(torch.optim.AdamW(self.trained.parameters(), **options))
+        parameters = self.trained.parameters()
+        adamw = torch.optim.AdamW(parameters, lr, weight_decay=weight_decay, fused=is_fused or None)
+        return self.one_cycle(adamw)
 
 
 class RangeStage(NetworkStage):

@@ -140,7 +140,6 @@ def write_page(
         path: the file, NAME.html.
         scans: the scans, in the order of the page's slider.
         taxonomy: the classes of the labels.
-        title: the title of the page.
 
     Returns:
         The evaluation of all labels that have a ground truth; the page shows it as a table.
@@ -227,7 +226,6 @@ def fill_page(
     """Return the text of a page with the viewer's markup, style and scripts.
 
     Args:
-        title: the title of the page.
         about: the values that the scripts read, for JSON.
         scans: the HTML elements of the scans.
         replaced: the texts of scripts that replace some of `SCRIPTS`, by the name of the script.

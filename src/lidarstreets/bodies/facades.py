@@ -122,7 +122,6 @@ def _storey(
 
     Args:
         rng: draws the tints of the parts of the wall.
-        facade: the look of the wall.
         width: width of the wall, metres.
         middles: x of the middles of the windows, metres.
         levels: heights of the lower edge of the storey, of the sills and of the tops of the

@@ -167,7 +167,6 @@ def rays_of(sensor: LidarModel, blocked: bool = False) -> Rays:
     """Return the rays of one rotation; the arrays are shared and read-only.
 
     Args:
-        sensor: the device.
         blocked: return the rays that the car blocks, instead of the others.
     """
     lasers = len(sensor.elevations)
@@ -278,7 +277,6 @@ def trace(
 
     Args:
         scenes: the meshes, in the frame of the street.
-        sensor: the device.
         pose: (4, 4) transform from the sensor's frame to the frame of the street at the moment when
             the sensor looks ahead.
         ground: gives the class and the tint of triangles without a class.

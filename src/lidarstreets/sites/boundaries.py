@@ -62,7 +62,6 @@ def line_up(
 
     Args:
         plot: the plot that the boundary belongs to.
-        boundary: the kind of boundary.
         start, end: ends of the line: x along the street and distance from its middle line, metres.
         gap: x where a drive begins and ends; no segment lies between them.
     """

@@ -36,7 +36,6 @@ def populate(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
     """Fill a street with everything that stands and moves in it.
 
     Args:
-        site: the street.
         ego_speed: speed of the car with the sensor, metres per second.
         ego: x and t of the car with the sensor at time 0; no body in its lane starts near it.
     """

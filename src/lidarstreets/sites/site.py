@@ -99,7 +99,6 @@ class Site:
         """Put a body at street coordinates, unless the place is not free.
 
         Args:
-            mesh: the body.
             x: street coordinate along the street, metres.
             t: street coordinate across the street, metres.
             yaw: its direction relative to the street, radians.

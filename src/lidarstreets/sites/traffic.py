@@ -163,7 +163,6 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
     """Add vehicles to all lanes. All vehicles in a lane have one speed, so that none hits another.
 
     Args:
-        site: the street.
         ego_speed: speed of the car with the sensor, metres per second.
         ego: x and t of the car with the sensor at time 0; no vehicle in its lane starts near it.
     """

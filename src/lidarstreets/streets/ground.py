@@ -39,7 +39,6 @@ class Ground(MiddleLine):
     Lengths are in metres. Unless a method says otherwise, it takes and returns arrays of one shape.
 
     Args:
-        style: the numbers of the street.
         length: length of the land along x.
         rng: draws the plan, the relief and the brightness.
         course: x where the sensor starts and ends; by default it drives along the whole street.

@@ -12,7 +12,6 @@ from lidarstreets.bodies import buildings, clutter, fences, furniture, plants, t
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Maker, Mesh, join, place
 from lidarstreets.sensing.lidar import Hits, RayScene, trace
-from lidarstreets.sensing.returns import draw_lasers, receive
 
 from fixtures.examples import first_of
 
@@ -164,16 +163,6 @@ def test_a_clipped_hedge_is_fuzzy_by_centimetres() -> None:
     depth = depth[(depth > 0) & (depth < 0.3)]
     assert len(depth) > 2000
     assert 0.01 < np.median(depth) < 0.05
-
-
-def test_leaves_differ_less_in_brightness_than_they_used_to() -> None:
-    hedge = plants.Hedge("box", 0.8, 1.5, depth=0.03, uneven=0.0, tint=0.0)
-    hits = hits_of(hedge.segment(np.random.default_rng(0), 8.0))
-    alike = replace(HDL64E, gain_spread=0.0, near_loss=0.0)
-    lasers = draw_lasers(alike, np.random.default_rng(0))
-    points, _, _ = receive(hits, alike, lasers, np.random.default_rng(0))
-    bright = points[points[:, 3] > 0, 3]
-    assert 0.12 < bright.std() / bright.mean() < 0.30
 
 
 @pytest.fixture(scope="module")

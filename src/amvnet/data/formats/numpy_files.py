@@ -44,7 +44,6 @@ def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read the points of an array file.
 
     Args:
-        path: the file.
         layout: the names of the columns, if the user states them.
 
     Raises:

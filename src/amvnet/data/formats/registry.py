@@ -54,7 +54,6 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     """Read a file of one scan.
 
     Args:
-        path: the file.
         ending: the ending of its format (`ending_of`).
         layout: the names of the columns in files that do not name them.
 
@@ -73,7 +72,6 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     """Read some columns of a file of points; each has one number per point, in any shape.
 
     Args:
-        path: the file.
         ending: the ending of its format, one of `COLUMN_READERS`.
         wanted: the possible names of each column, by its key.
 

@@ -66,7 +66,6 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     white space, commas or semicolons.
 
     Args:
-        path: the file.
         layout: the names of the columns, if the user states them; its types are not used.
 
     Raises:

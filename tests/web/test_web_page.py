@@ -1,9 +1,8 @@
-"""The page docs/try labels scans in Chromium as `onnx_runner.py` does."""
+"""The page of web/ labels scans in Chromium as `onnx_runner.py` does."""
 
 from __future__ import annotations
 
 import gzip
-import importlib.util
 import json
 import os
 import shutil
@@ -30,13 +29,14 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import load, save
 
 from fixtures.browser_pages import CHROMIUM, FLAGS
+from fixtures.pages import load_script
 from fixtures.scan_writers import write_pcd
 from fixtures.sensors import LASERS, place
 from fixtures.tiny import fresh_weights
 
 ROOT = Path(__file__).parents[2]
-DRIVER = ROOT / "tests" / "fixtures" / "try_page.mjs"
-PLAYWRIGHT = ROOT / "docs" / "try" / "node_modules" / "playwright-core"
+DRIVER = ROOT / "tests" / "fixtures" / "web_page.mjs"
+PLAYWRIGHT = ROOT / "web" / "node_modules" / "playwright-core"
 NODE = shutil.which("node")
 TIMEOUT = 1500  # seconds: a safety net; no outcome depends on it
 MEGABYTE = 1_000_000
@@ -60,7 +60,7 @@ MISSING = [
     for what, is_missing in (
         ("Chromium", CHROMIUM is None),
         ("Node.js", NODE is None),
-        ("docs/try/node_modules (make docs)", not PLAYWRIGHT.is_dir()),
+        ("web/node_modules (make docs)", not PLAYWRIGHT.is_dir()),
     )
     if is_missing
 ]
@@ -116,14 +116,8 @@ def served(folder: Path, headers: dict[str, str]) -> Iterator[Site]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> Path:
     """Build the page with tiny weights beside the built-in ones; return the folder around it."""
-    spec = importlib.util.spec_from_file_location("try_page", ROOT / "docs" / "try_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-
     site = tmp_path_factory.mktemp("site")
-    module.build(site / "try")
+    load_script("web/build.py").build(site / "try")
 
     # As docs/deployment.md says.
     save(fresh_weights(), own_weights(site))

@@ -1,4 +1,4 @@
-"""The modules of the page docs/try do what the package does, number by number: run in Node.js."""
+"""The modules of web/ do what the package does, number by number: run in Node.js."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ from fixtures.scan_writers import WRITERS, pcd_bytes, some_points
 from fixtures.sensors import LASERS, place
 
 NODE = shutil.which("node")
-PAGE = Path(__file__).parents[2] / "docs" / "try"
-DRIVER = Path(__file__).parents[1] / "fixtures" / "try_modules.mjs"
+PAGE = Path(__file__).parents[2] / "web"
+DRIVER = Path(__file__).parents[1] / "fixtures" / "web_modules.mjs"
 FORMATS = ("kitti.bin", "ascii.pcd", "binary.pcd", "compressed.pcd", "ascii.ply", "little.ply")
 POLAR = PolarViewConfig(radial=40, angular=36, vertical=8)
 NEIGHBOURS = 15

@@ -1,9 +1,9 @@
 """Build the page that labels scans in the browser, `try/` of the site, when MkDocs builds it.
 
-    python docs/try_page.py FOLDER
+    python web/build.py FOLDER
 
-builds the page alone. Its source is in docs/try. This module adds the networks of the built-in
-weights, a sample scan, the viewer, and ONNX Runtime Web, which `npm ci --prefix docs/try` fetches.
+builds the page alone. Its source is beside this module, which adds the networks of the built-in
+weights, a sample scan, the viewer, and ONNX Runtime Web, which `npm ci --prefix web` fetches.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from amvnet.viewing.shown_scans import UNLABELLED
 from lidarstreets import simulate
 
 ROOT = Path(__file__).parents[1]
-SOURCE = ROOT / "docs" / "try"
+SOURCE = ROOT / "web"
 PATTERNS = ("*.html", "*.css", "*.js", "*/*.js")  # the files of SOURCE; node_modules lies deeper
 RUNTIME = SOURCE / "node_modules" / "onnxruntime-web" / "dist"
 # ONNX Runtime Web for the CPU and, with jspi, for GPUs. Some hosts do not know that .mjs is
@@ -53,10 +53,18 @@ CACHE = ROOT / "build" / "try"  # keeps what takes a minute to make
 MADE_BY = ("config", "export", "models", "sensors", "weights")  # the packages that decide graphs
 
 
-def on_post_build(config: Any, **_: Any) -> None:
+def on_files(files: Any, config: Any) -> None:
+    """Name the page to MkDocs, so that other pages can link to it; MkDocs calls this first."""
+    from mkdocs.structure.files import File  # here, because the page is also built without MkDocs
+
+    index = str(SOURCE / "index.html")
+    files.append(File.generated(config, "try/index.html", abs_src_path=index))
+
+
+def on_post_build(config: Any) -> None:
     """Add the page to the site; MkDocs calls this at the end."""
-    out = Path(config["site_dir"]) / "try"
-    shutil.rmtree(out, ignore_errors=True)  # MkDocs has copied the source
+    out = Path(config.site_dir) / "try"
+    shutil.rmtree(out)  # MkDocs has copied index.html
     if RUNTIME.is_dir():
         build(out)
     else:
