@@ -312,6 +312,14 @@ def test_lost_returns_are_not_counted_as_labelled(data: Path) -> None:
     np.testing.assert_array_equal(before - counts_of(data), lost)
 
 
+@pytest.mark.parametrize("height", [float("nan"), -1.0])
+def test_an_impossible_sensor_is_refused(data: Path, height: float) -> None:
+    describe(data.parent, sensor={"height": height})
+    code, error = run_cli("check", data)
+    assert code == 2
+    assert "sensor: height: expected metres from 0 to 100" in error
+
+
 def test_labels_of_one_folder_are_counted_before_it_is_refused(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,8 +20,10 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     from amvnet.cli.tables import contents_table, unknown_table
     from amvnet.data.check import check_scans
     from amvnet.data.datasets.open import open_dataset
+    from amvnet.inference.reading import described_sensor
 
     dataset = open_dataset(data)
+    described_sensor(dataset)
     refused = None
     try:
         splits = choice.splits(dataset)
