@@ -8,8 +8,12 @@ const byId = (id) => document.getElementById(id);
 const worker = new Worker(`worker.js${location.search}`, { type: "module" });
 let models = [], file = null, asked = 0, started = 0, result = null;
 
-/** Ask the worker to label the file, or only to show it. Answers to earlier requests are then ignored. */
-function ask(isPreview = false) {
+/**
+ * Ask the worker to label the file, or only to show it. Answers to earlier requests are then ignored.
+ *
+ * If `isNew`, the worker takes other weights than the chosen ones if only these know the lasers of the scan.
+ */
+function ask({ isPreview = false, isNew = false } = {}) {
   if (!file || !models.length || document.documentElement.dataset.state === "unusable") return;
   result = null;
   asked++;
@@ -18,7 +22,8 @@ function ask(isPreview = false) {
   byId("assumed").textContent = "";
   for (const id of ["problem", "options", "downloads"]) byId(id).hidden = true;
   setState(isPreview ? "reading" : "labelling", `${file.name} …`);
-  worker.postMessage({ id: asked, file, folder: models[byId("weights").selectedIndex].folder, isPreview });
+  const chosen = models[byId("weights").selectedIndex].folder, others = isNew ? models.map(({ folder }) => folder) : [];
+  worker.postMessage({ id: asked, file, folders: [...new Set([chosen, ...others])], isPreview });
 }
 
 /** Show the state of the work. Programs that read the page, such as tests, find it in `data-state`. */
@@ -36,6 +41,7 @@ const ON_MESSAGE = {
   },
   shown: (shown) => {
     byId("assumed").textContent = `${shown.scan.name}: ${shown.text}`;
+    byId("weights").selectedIndex = models.findIndex(({ folder }) => folder === shown.folder);
     byId("options").hidden = !shown.text.includes("--");
     show(shown);
     if (document.documentElement.dataset.state === "reading") setState("shown", "");
@@ -45,7 +51,11 @@ const ON_MESSAGE = {
     const seconds = (performance.now() - started) / 1000;
     show(labelled);
     byId("downloads").hidden = false;
-    setState("labelled", `${counted(result.total)} points labelled in ${seconds.toFixed(1)} s, ${result.device}`);
+    const { isDoubtful, text } = result.verdict ?? {};
+    byId("problem").textContent = isDoubtful ? text : "";
+    byId("problem").hidden = !isDoubtful;
+    const sure = text && !isDoubtful ? `; ${text}` : "";
+    setState("labelled", `${counted(result.total)} points labelled in ${seconds.toFixed(1)} s, ${result.device}${sure}`);
   },
   failed: ({ text }) => fail(text),
 };
@@ -84,7 +94,7 @@ function open(files) {
   if (files.length > 1) return fail(`expected one scan, found ${files.length} files; drop one of them`);
   if (!files.length) return;  // a text was dropped, or no file was chosen
   [file] = files;
-  ask();
+  ask({ isNew: true });
 }
 
 async function start() {
@@ -108,12 +118,12 @@ async function start() {
   models = await fetchedJson("models.json", "mend it, or build the page again");
   byId("weights").replaceChildren(...models.map(({ title }) => new Option(title)));
   const { sample } = models[0];
-  if (file) return ask();  // a scan was dropped in the meantime
+  if (file) return ask({ isNew: true });  // a scan was dropped in the meantime
   if (!sample) return setState("empty", "");
   const contents = await (await fetched(sample)).blob();
   if (file) return;
   file = new File([contents], sample.split("/").at(-1));
-  ask(true);
+  ask({ isPreview: true });
 }
 
 start().catch((error) => fail(error.message));

@@ -1,13 +1,14 @@
 // Read and segment scans in a worker, so that the page stays responsive.
 //
-// The worker takes {id, file, folder, isPreview}: a scan file, and the folder of the weights. It sends messages with
-// the same id: {kind: "began", work}, {kind: "step", title, seconds}, {kind: "shown", ...}, {kind: "labelled", ...} and
+// The worker takes {id, file, folders, isPreview}: a scan file, and the folders of weights. The first weights are used
+// that know the lasers of the scan; if none do, the first ones. It sends messages with the same id: {kind: "began", work}, {kind: "step", title, seconds}, {kind: "shown", ...}, {kind: "labelled", ...} and
 // {kind: "failed", text}. A newer request ends the work on an older one after its step.
 
 import { InputError } from "./errors.js";
 import { unpacked } from "./files.js";
 import { segment } from "./method/amvnet.js";
 import { Networks, readDescription } from "./method/networks.js";
+import { verdictOf } from "./method/verdict.js";
 import { readCloud } from "./reading/read.js";
 import { normalise } from "./sensor/normalise.js";
 import { shownScan } from "./shown.js";
@@ -26,7 +27,7 @@ addEventListener("message", ({ data }) => {
   });
 });
 
-async function label({ id, file, folder, isPreview }) {
+async function label({ id, file, folders, isPreview }) {
   const send = (kind, content) => postMessage({ id, kind, ...content });
   const step = async (title, work) => {
     await new Promise((resolve) => setTimeout(resolve));  // newer requests arrive now
@@ -37,11 +38,9 @@ async function label({ id, file, folder, isPreview }) {
     return result;
   };
 
-  const description = await readDescription(folder);
   const cloud = await step("read", async () => readCloud(await bytesOf(file), file.name));
-  const expected = { view: description.range_view, ...description.expects };
-  const scan = await step("normalise", () => normalise(cloud, expected));
-  send("shown", { text: scan.text, ...shownScan(file.name, scan, null, description) });
+  const { folder, description, scan } = await step("normalise", () => fitting(cloud, folders));
+  send("shown", { folder, text: scan.text, ...shownScan(file.name, scan, null, description) });
   if (isPreview) return;
 
   runtime ??= await step("load ONNX Runtime", () => start(new URLSearchParams(location.search).get("device")));
@@ -54,7 +53,24 @@ async function label({ id, file, folder, isPreview }) {
   });
   const shown = shownScan(file.name, scan, segmentation, description);
   const labels = segmentation.labels[description.method], { places, count: total } = scan;
-  send("labelled", { ...shown, labels, places, total, classes: description.classes, device: runtime.text });
+  const verdict = verdictOf(segmentation, description, description.classes.length - 1);
+  send("labelled", { ...shown, verdict, labels, places, total, classes: description.classes, device: runtime.text });
+}
+
+/** Return the first of some folders whose weights know the lasers of a cloud, or the first one, with its scan. */
+async function fitting(cloud, folders) {
+  let first = null;
+  for (const folder of folders) {
+    try {
+      const description = await readDescription(folder);
+      const scan = normalise(cloud, { view: description.range_view, ...description.expects });
+      if (scan.isKnown) return { folder, description, scan };
+      first ??= { folder, description, scan };
+    } catch (error) {
+      if (!first || !(error instanceof InputError)) throw error;  // the first weights can label the scan
+    }
+  }
+  return first;
 }
 
 async function bytesOf(file) {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,27 +96,23 @@ def check_not_read(outputs: Iterable[Path], inputs: Iterable[Path | str | None])
     if not existing:
         return
 
-    read: dict[tuple[int, int], Path | str] = {}
-    for source in inputs:
-        if source is not None:
-            for identity in _identities(source):
-                read[identity] = source
+    read = {_identity(source): source for source in inputs if source is not None}
     for path in existing:
-        for identity in _identities(path):
-            if identity in read:
-                raise InputError(
-                    f"{path}: expected an output that is not an input, found the input "
-                    f"{read[identity]}; write to another place"
-                )
+        identity = _identity(path)
+        if identity is not None and identity in read:
+            raise InputError(
+                f"{path}: expected an output that is not an input, found the input "
+                f"{read[identity]}; write to another place"
+            )
 
 
-def _identities(path: Path | str) -> Iterator[tuple[int, int]]:
-    """Yield the device and the inode of a file, and the same of the link if the path is a link."""
-    for follows in (True, False):
-        with suppress(OSError, ValueError):  # nothing has this name
-            status = os.stat(path, follow_symlinks=follows)
-            if not stat.S_ISDIR(status.st_mode):
-                yield status.st_dev, status.st_ino
+def _identity(path: Path | str) -> tuple[int, int] | None:
+    """Return the device and the inode of the file that a path leads to; None if it is no file."""
+    with suppress(OSError, ValueError):  # nothing has this name
+        status = os.stat(path)
+        if not stat.S_ISDIR(status.st_mode):
+            return status.st_dev, status.st_ino
+    return None
 
 
 def _check_writable(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -198,3 +199,137 @@ def counts_of(data: Path) -> np.ndarray:
     records = dataset.records(dataset.sequences("all"))
     report = check_scans(dataset, {"train": records})
     return report.splits["train"].points[1:]
+
+
+def a_street(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (N, 4) of a road with a wall and a car, and their ids of `BASE`."""
+    rng = np.random.default_rng(seed)
+    low, high = np.zeros(3), np.ones(3)
+    parts = []
+    for raw, count, begin, size in (
+        (3, 4000, (-10, -8, -1.7), (20, 12, 0.05)),
+        (7, 2500, (-10, 4, -1.7), (20, 0.1, 5)),
+        (11, 700, (3, -2, -1.6), (2, 2, 1.2)),
+    ):
+        xyz = np.array(begin) + np.array(size) * rng.uniform(low, high, (count, 3))
+        parts.append(np.column_stack([xyz, rng.random(count), np.full(count, raw)]))
+    rows = np.concatenate(parts)
+    rows = rows[np.argsort(np.arctan2(rows[:, 1], rows[:, 0]))]  # as a LiDAR turns
+    return rows[:, :4].astype(np.float32), rows[:, 4].astype(np.uint32)
+
+
+Change = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def warnings_of(data: Path, change: Change, **described: Any) -> list[str]:
+    """Return the warnings about changed streets that are no scan of another split."""
+    for number, site in enumerate(SITES):
+        for index in range(2):
+            points, raw = change(*a_street(2 * number + index))
+            np.save(data.parent / f"{site}/{index}.npy", points)
+            write_labels(data.parent / f"{site}/{index}.label", raw)
+    dataset = open_own(describe(data.parent, **described))
+    splits = {name: dataset.records(dataset.sequences(name)) for name in ("train", "val")}
+    return list(check_scans(dataset, splits).warnings())
+
+
+@pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2, 1), (2, 1, 0)], ids=["z up", "y up", "x up"])
+@pytest.mark.parametrize("sign", [1, -1], ids=["", "down"])
+def test_labels_that_fit_their_points_are_passed_in_any_frame(
+    data: Path, axes: tuple[int, ...], sign: int
+) -> None:
+    def turn(points: np.ndarray, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.column_stack([sign * points[:, axes], points[:, 3]]), raw
+
+    assert warnings_of(data, turn) == []
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        lambda points: np.argsort(points[:, 0]),
+        lambda points: np.argsort(points[:, 2]),
+        lambda points: np.argsort(np.hypot(points[:, 0], points[:, 1])),
+        lambda points: np.random.default_rng(0).permutation(len(points)),
+    ],
+    ids=["by x", "by z", "by distance", "at random"],
+)
+def test_clouds_that_are_sorted_without_their_labels_are_reported(
+    data: Path, order: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    text = "\n".join(warnings_of(data, lambda points, raw: (points[order(points)], raw)))
+    assert "train: labels do not follow the geometry in 4 of 4 scans, such as a/0;" in text
+    assert "val: labels do not follow the geometry in 2 of 2 scans, such as c/0;" in text
+
+
+def test_ground_high_above_other_points_is_reported(data: Path) -> None:
+    swapped = {3: 7, 7: 3, 11: 11}
+
+    def swap(points: np.ndarray, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return points, np.array([swapped[number] for number in raw])
+
+    train, val = warnings_of(data, swap)
+    assert "more than 1 m above others at the same place: ground (7" in train
+    assert "more than 1 m above others at the same place: ground (7" in val
+    # Nothing is known of the height of other classes.
+    assert warnings_of(data, swap, classes={"a": 3, "b": 7, "c": 11}) == []
+
+
+def test_a_class_that_is_spread_like_random_points_is_reported(data: Path) -> None:
+    def sprinkle(points: np.ndarray, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        chosen = np.random.default_rng(len(points)).random(len(raw)) < 0.025
+        return points, np.where(chosen, 8, raw)
+
+    classes = {"ground": 3, "wall": 7, "bush": 8, "car": 11}
+    line, *_ = warnings_of(data, sprinkle, classes=classes)
+    assert line.startswith("train: points spread like random ones: bush;")
+
+
+def test_shares_that_no_street_has_are_reported(data: Path) -> None:
+    classes = {"road": 11, "motorcyclist": 3, "wall": 7}
+    lines = warnings_of(data, lambda points, raw: (points, raw), classes=classes)
+    assert [line.split(";")[0] for line in lines if "street" in line] == [
+        f"{split}: more points than on any street are motorcyclist (56%)"
+        for split in ("train", "val")
+    ]
+
+
+def test_scans_that_also_validate_are_reported_by_their_points(data: Path) -> None:
+    np.save(data.parent / "c/1.npy", np.load(data.parent / "b/0.npy"))
+    dataset = open_own(data)
+    splits = {name: dataset.records(dataset.sequences(name)) for name in ("train", "val")}
+    (line,) = (line for line in check_scans(dataset, splits).warnings() if "same points" in line)
+    assert line.startswith("val: 1 scan with the same points as in train, such as c/1 and b/0;")
+
+
+def test_lost_returns_are_not_counted_as_labelled(data: Path) -> None:
+    points = some_points(seed=0)
+    points[:10, 0] = np.nan
+    points[10:15, :3] = 0
+    before = counts_of(data)
+    np.save(data.parent / "a/0.npy", points)
+    lost = np.array([np.count_nonzero(RAW[:15] == raw) for raw in (3, 7, 11)])
+    np.testing.assert_array_equal(before - counts_of(data), lost)
+
+
+@pytest.mark.parametrize("height", [float("nan"), -1.0])
+def test_an_impossible_sensor_is_refused(data: Path, height: float) -> None:
+    describe(data.parent, sensor={"height": height})
+    code, error = run_cli("check", data)
+    assert code == 2
+    assert "sensor: height: expected metres from 0 to 100" in error
+
+
+def test_labels_of_one_folder_are_counted_before_it_is_refused(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    describe(data.parent, scans="a/*.npy")
+    code, error = run_cli("check", data)
+    assert code == 2
+    assert "two sequences" in error
+    assert f"{2 * np.count_nonzero(RAW == 3)}" in capsys.readouterr().out
+
+    write_labels(data.parent / "a/0.label", np.full(60, 55))
+    code, error = run_cli("check", data)
+    assert code == 2
+    assert "55 (60 points in 1 scan" in error

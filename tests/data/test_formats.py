@@ -9,6 +9,7 @@ import os
 import struct
 import sys
 import tracemalloc
+import zipfile
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from amvnet.data.formats.cloud import MAX_POINTS
 from amvnet.data.formats.find import find_scans, list_scans, read_cloud, scan_stem
 from amvnet.data.formats.pcd import unpack_lzf
 from amvnet.data.formats.pointcloud2 import read_message
+from amvnet.data.labels.readers import read_raw_labels
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 
@@ -272,6 +274,96 @@ def test_vertices_after_other_elements_are_read(tmp_path: Path) -> None:
     rows = b"".join(struct.pack(">dff", z, x, y) for x, y, z in xyz.tolist())
     path.write_bytes(header.encode() + b"\7\10" + rows)
     np.testing.assert_array_equal(read_scan(path).points[:, :3], xyz)
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_faces_may_come_before_the_vertices(tmp_path: Path, order: str) -> None:
+    xyz = some_points()[:, :3]
+    path = tmp_path / "a.ply"
+    elements = (
+        "element face 2\nproperty bool flat\nproperty list uchar short corners\n"
+        f"element vertex {len(xyz)}\nproperty float x\nproperty float y\nproperty float z\n"
+        "property bool seen\nend_header\n"
+    )
+    lines = "".join(f"{x!r} {y!r} {z!r} 1\n" for x, y, z in xyz.tolist())
+    path.write_text(f"ply\nformat ascii 1.0\n{elements}0 3 0 1 2\n1 4 0 1 2 3\n{lines}")
+    np.testing.assert_allclose(read_scan(path).points[:, :3], xyz, rtol=1e-6)
+
+    name = {"<": "little", ">": "big"}[order]
+    faces = struct.pack(f"{order}BB3hBB4h", 0, 3, 0, 1, 2, 1, 4, 0, 1, 2, 3)
+    rows = b"".join(struct.pack(f"{order}fff?", *row, True) for row in xyz.tolist())
+    header = f"ply\nformat binary_{name}_endian 1.0\n{elements}".encode()
+    path.write_bytes(header + faces + rows)
+    np.testing.assert_array_equal(read_scan(path).points[:, :3], xyz)
+
+    path.write_bytes(header + faces[:-5])  # as a copy that was cut off
+    fails(lambda: read_scan(path), path)
+
+
+def test_packed_points_that_cannot_be_unpacked_are_said_to_be_too_few(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcd"
+    header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10000\nHEIGHT 1\n"
+    data = struct.pack("<II", 100, 120_000) + bytes(100)
+    path.write_bytes(f"{header}DATA binary_compressed\n".encode() + data)
+    fails(lambda: read_scan(path), "expected 120000 bytes", "found 100 packed ones")
+
+
+def test_a_class_that_las_has_no_room_for_is_not_read_as_another_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.las"
+    for point_format, limit in ((0, 31), (6, 255)):
+        cloud = laspy.LasData(laspy.LasHeader(point_format=point_format))
+        cloud.xyz = some_points()[:10, :3]
+        cloud.classification = np.arange(10) + limit - 9
+        cloud.write(path)
+        read = partial(read_raw_labels, path, 10, "classification", missing=0)
+        assert read().tolist() == list(range(limit - 9, limit + 1))
+        if point_format == 0:
+            cloud.synthetic = np.arange(10) == 3  # a bit of what another program wrote as 32
+            cloud.write(path)
+            fails(read, path, "classes up to 31", "LAS 1.4")
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.txt"])
+def test_times_before_the_coordinates_are_not_called_a_map(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    rows = np.column_stack([np.linspace(1.6e9, 1.6e9 + 0.1, 60), some_points()[:, :3]])
+    np.save(path, rows) if name.endswith("npy") else np.savetxt(path, rows)
+    fails(lambda: read_scan(path), path, "column of times", "--columns")
+    rows[:, 1] += 5e6
+    np.save(path, rows) if name.endswith("npy") else np.savetxt(path, rows)
+    fails(lambda: read_scan(path), path, "map coordinates")
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "kind"),
+    [
+        ("a.bin", b"\x89PNG\r\n\x1a\n" + bytes(24), "a PNG picture"),
+        ("a.npy", b"\xff\xd8\xff\xe0" + bytes(28), "a JPEG picture"),
+        ("a.label", bytes(64), "labels"),
+        ("a_lidarseg.bin", bytes(64), "labels"),
+    ],
+)
+def test_files_that_are_no_scans_are_called_what_they_are(
+    tmp_path: Path, name: str, data: bytes, kind: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(data)
+    fails(lambda: read_scan(path), path, f"found {kind};")
+
+
+def test_a_folder_of_labels_is_called_one(tmp_path: Path) -> None:
+    (tmp_path / "a.label").write_bytes(bytes(64))
+    fails(lambda: find_scans(tmp_path), tmp_path, "holds labels")
+
+
+def test_an_array_that_an_archive_has_twice_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, points=some_points())
+    with zipfile.ZipFile(path) as archive:
+        data = archive.read("points.npy")
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("points.npy", data)
+    fails(lambda: read_scan(path), path, "points.npy", "2 times")
 
 
 def test_vertices_with_lists_are_refused(tmp_path: Path) -> None:

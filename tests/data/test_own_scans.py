@@ -328,6 +328,13 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
     np.testing.assert_array_equal(data.read_prediction(record, tmp_path / "out"), EXPECTED)
 
 
+@pytest.mark.parametrize("number", ["1:30", "1:30.5"])
+def test_numbers_that_yaml_takes_for_minutes_are_refused(site: Path, number: str) -> None:
+    path = describe(site.parent)
+    path.write_text(path.read_text() + f"sensor: {{height: {number}}}\n")
+    fails(lambda: open_own(path), path.name, number, "without :")
+
+
 @pytest.mark.parametrize(
     ("changes", "word"),
     [
@@ -335,6 +342,7 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
         ({"classes": {"a": "road"}}, "'road'"),
         ({"classes": {"a": 1, "b": [2, 1]}}, "1 twice"),
         ({"classes": {"a": {"ids": 1, "color": "red"}}}, "color"),
+        ({"classes": {"a": -1, "b": 2}}, "from 0 to 65535 as ids, found -1"),
         ({"ignored": [70000]}, "70000"),
         ({"scans": "../*.npy"}, "below"),
         ({"scans": "*/*.pcd"}, "found none"),

@@ -209,6 +209,7 @@ def test_the_description_says_what_a_program_needs(exported: Exports, name: str)
     assert len(description["range_channels"]) == 6
     assert len(description["polar_features"]) == 9
     assert description["assertion"]["threshold"] == model.assertion.threshold
+    assert description["doubt"]["usual"] == exported[name].weights.usual_uncertain
     assert description["point_head"] == {
         "neighbours": 4,
         "position_scale": model.point_head.position_scale,

@@ -137,7 +137,7 @@ def test_a_sensor_that_misses_points_is_still_the_same_one(tmp_path: Path) -> No
 
 def said(entries: list[Entry], usual: float = 0.1) -> list[str]:
     lines: list[str] = []
-    report_certainty(entries, usual, lines.append)
+    report_certainty(entries, "amvnet", usual, lines.append)
     return lines
 
 

@@ -432,6 +432,18 @@ def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, text: str, 
     assert [Entry(*json.loads(line)) for line in lines[1:]] == ENTRIES[:done]
 
 
+def test_a_killed_run_leaves_no_journal_of_the_run_before(tmp_path: Path) -> None:
+    """Its labels may have been replaced since."""
+    with Journal(tmp_path, {"x": 1}) as journal:
+        journal.add(ENTRIES[0])
+        journal.close()
+    with Journal(tmp_path, {"x": 2}) as journal:  # is not closed
+        journal.add(ENTRIES[1])
+    run = read_journals(tmp_path)
+    assert run.settings == [{"x": 2}]
+    assert list(run.entries.values()) == ENTRIES[1:2]
+
+
 def test_the_journal_is_at_most_as_late_as_the_writing(tmp_path: Path) -> None:
     """Scans that are written are in the journal when the next but one is segmented."""
     lines: list[int] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,9 +90,32 @@ def test_a_result_has_the_share_of_its_valid_points() -> None:
     assert result.verdict.usual == 0.1
 
 
-@pytest.mark.parametrize("method", ["rv", "bev"])
-def test_one_network_has_no_verdict(method: Any) -> None:
-    assert amvnet.load(fresh_weights(), method=method)(POINTS).verdict is None
+@pytest.mark.parametrize("method", ["rv", "rv-knn", "bev"])
+def test_one_network_is_judged_by_its_mean_entropy(method: Any) -> None:
+    points = np.concatenate([POINTS, np.full((100, 4), np.nan, np.float32)])
+    result = amvnet.load(fresh_weights(), method=method)(points)
+    network = result.bev if method == "bev" else result.rv
+    assert network is not None
+    classes = network.shape[1]
+    entropies = []
+    for row in network[: len(POINTS)].tolist():
+        entropies.append(sum(-p * math.log(p, classes) for p in row if p > 0))
+    verdict = result.verdict
+    assert verdict is not None
+    assert verdict.share == pytest.approx(np.mean(entropies), abs=1e-6)
+    assert verdict.is_doubtful  # the network has learnt nothing
+    assert "entropy" in str(verdict)
+
+
+@pytest.mark.parametrize(
+    ("method", "real", "changed"), [("rv", 0.31, 0.40), ("rv-knn", 0.31, 0.40), ("bev", 0.21, 0.24)]
+)
+def test_one_network_is_trusted_on_real_scans_only(
+    method: str, real: float, changed: float
+) -> None:
+    """The largest entropy of a real scan, and the smallest of most changed ones (docs/log.md)."""
+    assert not Verdict.of(method, real, 0.9).is_doubtful
+    assert Verdict.of(method, changed, 0.9).is_doubtful
 
 
 def test_the_share_is_that_of_the_valid_points() -> None:
@@ -158,3 +182,12 @@ def test_predict_by_one_network_says_nothing_of_it(
 ) -> None:
     weights = without(fresh_weights(), "polar_net", "point_head")
     assert "uncertain" not in said(world, tmp_path, weights, capsys, "--method", "rv")
+
+
+@pytest.mark.parametrize("method", ["rv", "bev"])
+def test_predict_warns_of_one_network_that_is_not_sure(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
+) -> None:
+    text = said(world, tmp_path, fresh_weights(), capsys, "--method", method)
+    assert "warning: do not rely on these labels: " in text
+    assert "is the mean entropy of the network (usual: " in text

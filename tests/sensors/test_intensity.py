@@ -15,7 +15,7 @@ import amvnet
 from amvnet.config.schema import RangeViewConfig, Recipe
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.training_data import Source, TrainingData
-from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.cloud import WILD_SHARE, Cloud
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import (
@@ -227,6 +227,10 @@ def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> 
     clipped[7, 3] = 1
     np.testing.assert_array_equal(segmenter(wild).labels, segmenter(clipped).labels)
     assert wild[7, 3] == 300
+
+    many = scan_points()
+    many[: round(2 * WILD_SHARE * len(many)) + 1, 3] = 300
+    fails(lambda: segmenter(many), "[0, 1]", "divide")
 
     raw = with_intensities(fresh_weights(), np.linspace(0, 255, 11).tolist())
     assert len(amvnet.load(raw)(wrong).labels) == len(points)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import errno
+import multiprocessing
 import os
 import shutil
+import signal
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -12,7 +15,9 @@ from typing import Any
 import pytest
 import torch
 
+from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.files import alone_in
+from amvnet.scan import Scan
 from amvnet.training.stage import WholeCheckpoints
 
 from fixtures.commands import files, refusal, run_cli
@@ -75,6 +80,33 @@ def test_a_stage_is_trained_by_one_call_at_a_time(world: Path, tmp_path: Path, s
         assert run_cli(*command(world, out).split(), "--stage", "bev", "--resume") == (0, "")
     assert run_cli(*command(world, out).split(), "--resume") == (0, "")
     assert not [name for name in files(out) if "lock" in name]
+
+
+def test_a_run_does_not_write_into_a_dataset(world: Path, tmp_path: Path) -> None:
+    shutil.copytree(world / "data", tmp_path / "data")
+    before = files(tmp_path)
+    train = f"train {world}/recipe.yaml --data {world}/data --out {tmp_path}/data"
+    assert f"{tmp_path}/data: expected a new folder" in refusal(train)
+    assert files(tmp_path) == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only forked processes have the patch")
+def test_a_killed_process_that_reads_scans_is_one_line(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = SemanticKitti.read
+
+    def read_or_die(*arguments: Any, **options: Any) -> Scan:
+        if multiprocessing.parent_process() is not None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return read(*arguments, **options)
+
+    monkeypatch.setattr(SemanticKitti, "read", read_or_die)
+    options = "--stage rv --training.workers 1"
+    train = f"train {world}/recipe.yaml --data {world}/data --out {tmp_path}/run {options}"
+    line = refusal(train)
+    assert "training.workers" in line
+    assert "killed" in line
 
 
 def test_a_run_that_cannot_begin_leaves_no_folder(world: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import re
 import shutil
 import subprocess
 import threading
@@ -24,6 +25,7 @@ from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.export.onnx import export
+from amvnet.inference.segmentation import Verdict, uncertain_share
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import load, save
@@ -199,7 +201,7 @@ def session(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
     cases = [
         {"model": 0, "kinds": ["label", "npy"]},
         {"file": str(files["kitti"]), "model": 0},
-        {"file": str(files["nuscenes"]), "model": 1},
+        {"file": str(files["nuscenes"]), "model": 0},  # whose lasers only model 1 knows
         {"file": str(files["pcd"]), "model": 0},
         {"file": str(files["own"]), "model": 2},
         {"file": str(files["broken"]), "model": 0},
@@ -225,15 +227,20 @@ def plain(
         return drive(site, cases, tmp_path_factory.mktemp("plain"))
 
 
-def reference(path: Path, weights: str | Path, graphs: Path) -> np.ndarray:
-    """Return the raw ids by `onnx_runner.py` of a scan that is normalised as in `predict`."""
+def reference(path: Path, weights: str | Path, graphs: Path) -> tuple[np.ndarray, Verdict]:
+    """Return the raw ids of a scan that is normalised as in `predict`, and the verdict on them.
+
+    They are by `onnx_runner.py`.
+    """
     loaded = load(weights)
     normaliser = Normaliser(loaded.expects)
     cloud = read_file(path, ending_of(path), UNKNOWN)
     normaliser.expect("scans", lambda: cloud)
     scan = normaliser(cloud, "scans")
 
-    return loaded.taxonomy.to_raw(OnnxSegmenter(graphs)(scan).labels)
+    result = OnnxSegmenter(graphs)(scan)
+    verdict = Verdict(uncertain_share(result.labels, result.uncertain), loaded.usual_uncertain)
+    return loaded.taxonomy.to_raw(result.labels), verdict
 
 
 WEIGHTS = {
@@ -252,9 +259,18 @@ def test_a_scan_gets_the_labels_of_the_onnx_runner(
     graphs = shutil.copytree(folder / "try" / weights, tmp_path / weights)
     for graph in graphs.glob("*.onnx"):
         graph.write_bytes(gzip.decompress(graph.read_bytes()))  # the page unpacks them itself
-    expected = reference(session.files[name], weights, graphs)
+    expected, verdict = reference(session.files[name], weights, graphs)
     check_labels(session.results[name], expected)
+    check_verdict(session.results[name], verdict)
     assert len(np.unique(expected)) > 3
+
+
+def check_verdict(result: dict[str, Any], verdict: Verdict) -> None:
+    line = result["problem"] if verdict.is_doubtful else result["line"]
+    share = re.search(r"([0-9.]+)% of the points are uncertain \(usual: ", line)
+    assert share is not None, line
+    assert float(share[1]) == pytest.approx(100 * verdict.share, abs=0.5)
+    assert ("do not rely" in result["problem"]) == verdict.is_doubtful
 
 
 def check_labels(result: dict[str, Any], expected: np.ndarray) -> None:
@@ -267,7 +283,7 @@ def check_labels(result: dict[str, Any], expected: np.ndarray) -> None:
 def test_own_weights_beside_the_page_label_as_the_onnx_runner(
     session: Session, folder: Path
 ) -> None:
-    expected = reference(session.files["own"], own_weights(folder), folder / "try" / OWN)
+    expected, _ = reference(session.files["own"], own_weights(folder), folder / "try" / OWN)
     check_labels(session.results["own"], expected)
 
 

@@ -13,8 +13,9 @@ const LEAST_POINTS = 100;  // the least number of points on which a sensor is me
 const SAME_BEAMS = 1.4;  // the largest ratio of two numbers of lasers that are alike
 
 /**
- * Return {points, rows, places, text}. The valid points are normalised (4 n: x, y, z in metres, intensity in [0, 1]).
- * With them come their rows in the range image, or null, their places in the cloud, and a line on what was assumed.
+ * Return {points, rows, places, text, isKnown}. The valid points are normalised (4 n: x, y, z in metres, intensity in
+ * [0, 1]). With them come their rows in the range image, or null, their places in the cloud, a line on what was assumed,
+ * and whether the weights have seen such lasers.
  *
  * `expected` describes the scans that the weights know: {view, sensor, intensity, as_is}.
  */
@@ -32,8 +33,8 @@ export function normalise(cloud, expected) {
   const moved = raised(points, toTrained);
   matchIntensity(moved, expected.intensity);
   const texts = [map.text, negativeText(cloud), ...frameTexts(frame), heightText(frame, sensor.height), lasersText(lasers)];
-  const text = `assumed ${texts.filter(Boolean).join(", ")}${sensorText(lasers, sensor)}`;
-  return { count, points: moved, rows, places, text };
+  const unknown = sensorText(lasers, sensor), text = `assumed ${texts.filter(Boolean).join(", ")}${unknown}`;
+  return { count, points: moved, rows, places, text, isKnown: !unknown };
 }
 
 /** Return the points (4 n, float32) that are finite and not at the origin, and their places in the cloud. */

@@ -147,7 +147,7 @@ class CloudSegmenter:
         result = self._segment(scan, yaw=0.0 if self._fuse is None else self._fuse.yaw(origin))
         if self._fuse is not None:  # last, because odometry often comes after its scan
             result = self._fuse(origin, cloud.xyz, result)
-        verdict = result.verdict  # None for a single network
+        verdict = result.verdict if result.has_two_networks else None
         points = LabelledPoints(
             cloud.xyz,
             raw=self.taxonomy.to_raw(result.labels),

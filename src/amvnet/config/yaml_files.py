@@ -12,6 +12,7 @@ from amvnet.errors import InputError, shown
 
 LARGEST_YAML = 50_000  # largest size of a YAML file, bytes; PyYAML takes a second for it
 DEEPEST_YAML = 50  # largest number of levels of nested values in a YAML file
+NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")  # PyYAML's tags of numbers
 
 
 def read_yaml(path: Path, content: str) -> Any:
@@ -78,6 +79,7 @@ class _BoundedLoader(yaml.SafeLoader):
 
     The depth of values is limited. Aliases are refused, because ten lines with aliases can stand
     for billions of values. A key may not occur twice, because one of its values would be lost.
+    Numbers such as 1:30 are refused, which YAML 1.1 takes for minutes and reads as 90.
     """
 
     def __init__(self, stream: str) -> None:
@@ -106,3 +108,8 @@ class _BoundedLoader(yaml.SafeLoader):
                 raise yaml.YAMLError(f"the key {shown(key)} twice")
             keys.add(key)
         return mapping
+
+    def construct_scalar(self, node: Any) -> Any:
+        if node.tag in NUMBERS and ":" in node.value:
+            raise yaml.YAMLError(f"{node.value[:50]}, write a number without : or a text in quotes")
+        return super().construct_scalar(node)

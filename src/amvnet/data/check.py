@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +11,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.plausible import (
+    GROUND,
+    MIN_FOLLOWING,
+    coarse_names,
+    following,
+    frequent_classes,
+    neighbours,
+    raised,
+    raised_classes,
+    scattered_classes,
+)
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError
 from amvnet.progress import Progress, counted, no_progress
@@ -24,12 +36,18 @@ class Contents:
     """The contents of a labelled scan.
 
     Attributes:
-        valid: the number of valid points (`Scan.valid`).
-        ids: the number of points by raw id.
+        points: (K + 1,) the number of points by train id; lost returns (`Scan.valid`) have 0.
+        unknown: the number of points by raw id that is neither in a class nor ignored.
+        neighbours: (2, K + 1) as `plausible.neighbours` returns them.
+        raised: (K + 1,) as `plausible.raised` returns them.
+        digest: equal for equal points.
     """
 
-    valid: int
-    ids: Mapping[int, int]
+    points: np.ndarray
+    unknown: Mapping[int, int]
+    neighbours: np.ndarray
+    raised: np.ndarray
+    digest: bytes
 
 
 @dataclass
@@ -58,36 +76,44 @@ class SplitReport:
         unlabelled: the names of the scans without a label file, which are skipped.
         broken: the messages about broken scans, by the name of the scan.
         unknown: how often each unknown raw id occurs.
+        neighbours, raised: the sums of those in `Contents`.
+        stray: the names of the scans whose labels do not follow the geometry.
+        names: the name of a scan by its digest.
     """
 
     points: np.ndarray
     scans_with: np.ndarray
+    neighbours: np.ndarray
+    raised: np.ndarray
     scans: list[str] = field(default_factory=list)
     unlabelled: list[str] = field(default_factory=list)
     broken: dict[str, str] = field(default_factory=dict)
     unknown: dict[int, UnknownId] = field(default_factory=dict)
+    stray: list[str] = field(default_factory=list)
+    names: dict[bytes, str] = field(default_factory=dict)
 
-    def add(self, record: ScanRecord, contents: Contents, lookup: np.ndarray) -> None:
-        """Add the points of a scan to the counts.
+    @classmethod
+    def empty(cls, size: int) -> SplitReport:
+        """Return the report of no scans, given K, the number of classes."""
+        counts = np.zeros((5, size + 1), dtype=np.int64)
+        return cls(counts[0], counts[1], counts[2:4], counts[4])
 
-        Args:
-            record: the scan.
-            contents: what the scan holds.
-            lookup: train ids by raw id; UNKNOWN for raw ids that the dataset does not define.
-        """
+    def add(self, record: ScanRecord, contents: Contents) -> None:
+        """Add the contents of a scan."""
         self.scans.append(record.name)
-        counts = np.zeros_like(self.points)
-        for raw_id, count in contents.ids.items():
-            train_id = lookup[raw_id] if raw_id < len(lookup) else UNKNOWN
-            if train_id != UNKNOWN:
-                counts[train_id] += count
-                continue
+        self.names[contents.digest] = record.name
+        self.points += contents.points
+        self.scans_with += contents.points > 0
+        self.neighbours += contents.neighbours
+        self.raised += contents.raised
+        if following(contents.neighbours)[-1] < MIN_FOLLOWING:
+            self.stray.append(record.name)
+
+        for raw_id, count in contents.unknown.items():
             example = os.path.normpath(record.labels_path or record.points_path)
             entry = self.unknown.setdefault(raw_id, UnknownId(example=example))
             entry.points += count
             entry.scans += 1
-        self.points += counts
-        self.scans_with += counts > 0
 
 
 @dataclass(frozen=True)
@@ -99,21 +125,18 @@ class Report:
         taxonomy: the classes of the dataset.
         splits: the report of each split, by the name of the split.
         contents: what each scan holds, by the name of the scan; broken scans are left out.
-        lookup: int16 train ids by raw id (`Dataset.train_ids_by_raw`).
     """
 
     spec: str
     taxonomy: Taxonomy
     splits: Mapping[str, SplitReport]
     contents: Mapping[str, Contents]
-    lookup: np.ndarray
 
     def count_points(self, records: Sequence[ScanRecord]) -> np.ndarray:
         """Return the number of points of some of the scans by train id, (K + 1,) int64."""
         counts = np.zeros(self.taxonomy.size + 1, dtype=np.int64)
         for record in records:
-            for raw_id, count in self.contents[record.name].ids.items():
-                counts[self.lookup[raw_id]] += count
+            counts += self.contents[record.name].points
         return counts
 
     @property
@@ -183,6 +206,41 @@ class Report:
             ]
             if split.scans and absent and len(absent) < self.taxonomy.size:
                 yield f"{name}: no point of {', '.join(absent)}"
+            yield from (f"{name}: {line}" for line in self._implausible(split))
+
+        names = self.splits["train"].names if "train" in self.splits else {}
+        for name, split in self.splits.items():
+            common = [digest for digest in split.names if digest in names]
+            if name != "train" and common:
+                yield (
+                    f"{name}: {counted(len(common), 'scan')} with the same points as in train, "
+                    f"such as {split.names[common[0]]} and {names[common[0]]}; leave out one of "
+                    "both"
+                )
+
+    def _implausible(self, split: SplitReport) -> Iterator[str]:
+        """Yield a line for each thing that is implausible in the labels of a split."""
+        frequent = ", ".join(frequent_classes(split.points, self.taxonomy))
+        if frequent:
+            yield (
+                f"more points than on any street are {frequent}; are the labels ids of another "
+                "table, such as train ids?"
+            )
+        high = ", ".join(raised_classes(split.raised, split.points, self.taxonomy))
+        if high:
+            yield (
+                "expected the ground below everything else, found points more than 1 m above "
+                f"others at the same place: {high}; correct the ids or the labels"
+            )
+        scattered = ", ".join(scattered_classes(split.neighbours, self.taxonomy))
+        if split.stray:
+            yield (
+                f"labels do not follow the geometry in {len(split.stray)} of "
+                f"{counted(len(split.scans), 'scan')}, such as {split.stray[0]}; write the labels "
+                "in the order of the points"
+            )
+        elif scattered:
+            yield f"points spread like random ones: {scattered}; correct their labels"
 
 
 def check_scans(
@@ -207,23 +265,21 @@ def check_scans(
             labelled[record.name] = record
     found = _find_contents(dataset, labelled, progress, processes)
 
-    lookup = dataset.train_ids_by_raw()
     reports = {}
     for split, records in splits.items():
-        size = dataset.taxonomy.size + 1
-        report = SplitReport(np.zeros(size, np.int64), np.zeros(size, np.int64))
+        report = SplitReport.empty(dataset.taxonomy.size)
         for record in records:
             contents = found.get(record.name)
             if contents is None:
                 report.unlabelled.append(record.name)
             elif isinstance(contents, Contents):
-                report.add(record, contents, lookup)
+                report.add(record, contents)
             else:
                 report.broken[record.name] = contents
         reports[split] = report
 
     whole = {name: item for name, item in found.items() if isinstance(item, Contents)}
-    return Report(dataset.spec, dataset.taxonomy, reports, whole, lookup)
+    return Report(dataset.spec, dataset.taxonomy, reports, whole)
 
 
 def _find_contents(
@@ -260,10 +316,11 @@ def _read_all(
     dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
 ) -> dict[str, Contents | str]:
     """Return the contents of scans, or the message about a broken scan, by the name of the scan."""
+    is_ground = np.array([name == GROUND for name in coarse_names(dataset.taxonomy)])
 
     def read(record: ScanRecord) -> Contents | str:
         try:
-            return _contents_of(dataset, record)
+            return _contents_of(dataset, record, is_ground)
         except InputError as error:
             return str(error)
         except OSError as error:  # for example, a network disk has failed
@@ -279,11 +336,25 @@ def _read_all(
     return found
 
 
-def _contents_of(dataset: Dataset, record: ScanRecord) -> Contents:
-    """Read a scan and its labels; raise InputError if it cannot be trained on."""
-    scan = dataset.read_unchanged(record)
-    raw = dataset.raw_labels(record, len(scan))
-    counts = np.bincount(raw.astype(np.int64) & INSTANCE_MASK)
-    ids = {int(raw_id): int(counts[raw_id]) for raw_id in np.flatnonzero(counts)}
+def _contents_of(dataset: Dataset, record: ScanRecord, is_ground: np.ndarray) -> Contents:
+    """Read a scan and its labels; raise InputError if it cannot be trained on.
 
-    return Contents(check_trainable(scan), ids)
+    Args:
+        is_ground: (K + 1,) bool, whether each train id is of the ground.
+    """
+    scan = dataset.read_unchanged(record)
+    raw = dataset.raw_labels(record, len(scan)).astype(np.int64) & INSTANCE_MASK
+    labels = dataset.train_ids_by_raw()[raw]
+    unknown = dict(zip(*np.unique(raw[labels == UNKNOWN], return_counts=True), strict=True))
+
+    check_trainable(scan)
+    is_valid = scan.valid
+    labels = np.where(is_valid & (labels != UNKNOWN), labels, 0)
+    shown = (scan.points[is_valid, :3].astype(np.float64), labels[is_valid])
+    return Contents(
+        np.bincount(labels, minlength=len(is_ground)),
+        {int(raw_id): int(count) for raw_id, count in unknown.items()},
+        neighbours(*shown, dataset.taxonomy.size),
+        raised(*shown, is_ground),
+        hashlib.blake2b(scan.points.tobytes()).digest(),
+    )

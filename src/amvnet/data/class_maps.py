@@ -29,19 +29,22 @@ class ClassMap:
     target: Taxonomy
     sources: Mapping[str, int]
 
-    def table(self, taxonomy: Taxonomy) -> np.ndarray:
-        """Return the train ids in `target`, (K + 1,) uint8, indexed by a taxonomy's train ids.
+    def train_id(self, name: str) -> int:
+        """Return the train id in `target` that the class of a name becomes.
 
         A class that the map does not name becomes the target class of the same name. If there is no
         such class, it is ignored (0).
+        """
+        same_name = self.target.classes.index(name) + 1 if name in self.target.classes else 0
+        return self.sources.get(name, same_name)
+
+    def table(self, taxonomy: Taxonomy) -> np.ndarray:
+        """Return the train ids in `target`, (K + 1,) uint8, indexed by a taxonomy's train ids.
 
         Raises:
             InputError: if the map names none of the classes.
         """
-        train_ids = [0]
-        for name in taxonomy.classes:
-            same_name = self.target.classes.index(name) + 1 if name in self.target.classes else 0
-            train_ids.append(self.sources.get(name, same_name))
+        train_ids = [0, *map(self.train_id, taxonomy.classes)]
         if not any(train_ids):
             raise InputError(
                 f"--classes {self.target.name}: expected a map of the classes of {taxonomy.name} "

@@ -20,6 +20,7 @@ from amvnet.errors import InputError, import_optional
 from amvnet.export.int8 import KEEPS_FIRST_LAYER, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, remove_notes
 from amvnet.files import atomic_write, publish, temporary_folder
+from amvnet.inference.segmentation import Verdict
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName, check_method, widest_method
 from amvnet.models.point_head import head_features, point_table
@@ -181,6 +182,7 @@ def describe_export(weights: Weights, method: MethodName, graphs: dict[str, Any]
     for train_id, (name, raw, color) in enumerate(rows):
         classes.append({"id": train_id, "name": name, "raw_id": raw, "color": list(color)})
 
+    verdict = Verdict.of(method, 0, weights.usual_uncertain_at(None))
     description = {
         "format": FORMAT,
         "made_by": f"amvnet {version('amvnet')}, torch {torch.__version__}",
@@ -188,6 +190,7 @@ def describe_export(weights: Weights, method: MethodName, graphs: dict[str, Any]
         "sensor": weights.sensor,
         "points": {"columns": ["x", "y", "z", "intensity"], "farthest": FARTHEST},
         "expects": weights.expects.to_dict(),
+        "doubt": {"usual": verdict.usual, "unusual_odds": verdict.unusual_odds},
         "range_view": to_dict(model.range_view),
         "range_channels": ["x", "y", "z", "intensity", "range", "mask"],
         "polar_view": to_dict(model.polar_view),

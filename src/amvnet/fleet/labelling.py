@@ -37,7 +37,7 @@ from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import READ_AHEAD
-from amvnet.inference.segmentation import Segmentation, uncertain_share
+from amvnet.inference.segmentation import Segmentation
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.normalise import Normaliser
@@ -272,7 +272,7 @@ def statistics(result: Segmentation, taxonomy: Taxonomy) -> Row:
 
     names = taxonomy.classes
     return {
-        "uncertain": uncertain_share(ids, result.uncertain),
+        "uncertain": result.doubt,
         "class_points": dict(zip(names, counts[1:].tolist(), strict=True)),
         "class_uncertain": dict(zip(names, uncertain[1:].tolist(), strict=True)),
         "class_confidence": dict(zip(names, means[1:], strict=True)),

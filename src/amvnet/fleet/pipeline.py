@@ -31,7 +31,6 @@ from amvnet.inference.journal import Entry
 from amvnet.inference.pipeline import check_faults
 from amvnet.inference.predict import report_certainty
 from amvnet.inference.request import LabellingRequest
-from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.sensors.measure import MEASURED_SCANS
 
@@ -338,10 +337,9 @@ class FleetRun:
                     lost = f"{row['path']}: expected its labels in {row['labels']}, found none; "
                     faults.append(row["error"] or f"{lost}label it again with --resume")
 
-        if METHODS[self.request.method].has_two_networks:
-            usual = self.request.weights.usual_uncertain_at(self.request.tau)
-            drives = [Entry("", "", drive, points[drive], uncertain[drive]) for drive in points]
-            report_certainty(drives, usual, self._report)
+        usual = self.request.weights.usual_uncertain_at(self.request.tau)
+        drives = [Entry("", "", drive, points[drive], uncertain[drive]) for drive in points]
+        report_certainty(drives, self.request.method, usual, self._report)
         check_faults(faults, len(self._names))
         return written
 

@@ -58,7 +58,7 @@ def results_schema(taxonomy: Taxonomy) -> pa.Schema:
             "path": pa.string(),
             "labels": pa.string(),  # the URL of the label file
             "points": pa.int32(),  # the number of valid points
-            "uncertain": pa.float32(),  # the share of uncertain points, in [0, 1]
+            "uncertain": pa.float32(),  # the share of uncertain points, or the entropy
             "class_points": counts,
             "class_uncertain": counts,
             "class_confidence": means,  # the mean of the points' largest scores

@@ -25,7 +25,7 @@ class Entry(NamedTuple):
             on which the sensor is measured.
         sensor: the name of the recording, whose scans have one sensor.
         points: the number of valid points.
-        uncertain: the number of uncertain points.
+        uncertain: the number of uncertain points: `points` times `Segmentation.doubt`.
     """
 
     scan: str

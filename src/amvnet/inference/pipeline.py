@@ -283,7 +283,7 @@ class Pipeline:
         scan.write_labels(folder, loaded, result, self.output.kind)
 
         points = int(np.count_nonzero(loaded.scan.valid))
-        uncertain = int(np.count_nonzero(result.uncertain))
+        uncertain = round(result.doubt * points)
         key = _key(scan)
         return Entry(key, self._origins[key], scan.source, points=points, uncertain=uncertain)
 

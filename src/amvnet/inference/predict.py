@@ -14,7 +14,6 @@ from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_fa
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Normaliser
@@ -93,8 +92,7 @@ def predict(
             report(f"warning: {other_run}")
     entries, faults = pipeline.run(request.settings, progress)
 
-    if METHODS[segmenter.method].has_two_networks:
-        report_certainty(entries, segmenter.usual_uncertain, report)
+    report_certainty(entries, segmenter.method, segmenter.usual_uncertain, report)
     check_faults(faults, len(scans))
     return len(scans)
 
@@ -120,10 +118,13 @@ def segment_by(
     return segment
 
 
-def report_certainty(entries: Sequence[Entry], usual: float | None, report: Reporter) -> None:
+def report_certainty(
+    entries: Sequence[Entry], method: str, usual: float | None, report: Reporter
+) -> None:
     """Report how sure the labels are, which recordings have doubtful labels, and what to try.
 
     Args:
+        method: the name of the method that gave the labels.
         usual: the usual share of uncertain points, in [0, 1]; None if it is not known.
     """
     points: Counter[str] = Counter()
@@ -137,11 +138,11 @@ def report_certainty(entries: Sequence[Entry], usual: float | None, report: Repo
 
     doubtful = {}
     for sensor in points:
-        verdict = Verdict(uncertain[sensor] / points[sensor], usual)
+        verdict = Verdict.of(method, uncertain[sensor] / points[sensor], usual)
         if verdict.is_doubtful:
             doubtful[sensor] = verdict
 
-    verdict = Verdict(uncertain.total() / points.total(), usual)
+    verdict = Verdict.of(method, uncertain.total() / points.total(), usual)
     if len(points) == 1 or not doubtful:
         report(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else verdict.shares)
         return

@@ -113,11 +113,19 @@ def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
         InputError: if the YAML file describes an impossible sensor.
     """
     if dataset.described_sensor is not None and normaliser.sensor == Sensor():
-        with errors_of(f"{dataset.spec}: sensor"):
-            sensor = make_sensor(dataset.described_sensor)
-        normaliser = normaliser.for_sensor(sensor)
+        normaliser = normaliser.for_sensor(described_sensor(dataset))
 
     for source, scans in dataset.recordings().items():
         for scan in scans:
             normaliser.expect(source, scan.read)
     return dataset.normalised_by(normaliser)
+
+
+def described_sensor(dataset: Dataset) -> Sensor:
+    """Return what a dataset's YAML file says of the sensor.
+
+    Raises:
+        InputError: if there is no such sensor.
+    """
+    with errors_of(f"{dataset.spec}: sensor"):
+        return make_sensor(dataset.described_sensor)

@@ -16,6 +16,7 @@ import yaml
 from amvnet.config.nested import flat, to_dict
 from amvnet.config.yaml_files import parse_yaml
 from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.open import is_dataset
 from amvnet.data.datasets.training_data import TrainingData
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, remove_unfinished
@@ -65,12 +66,17 @@ def check_folder(plan: Plan) -> None:
 
     Raises:
         InputError: if a file that the run would write exists in the folder of no run, or is an
-            input.
+            input, or the folder is a dataset.
     """
     names = (RECIPE, WEIGHTS, COUNTS, CURVES, RECORD, *PART_OF)
     check_not_read([plan.out / name for name in names], plan.also_read)
     if is_run(plan.out):
         return
+    if is_dataset(str(plan.out)):
+        raise InputError(
+            f"{plan.out}: expected a new folder or the folder of a run, found a dataset; give "
+            "another folder"
+        )
     for name in names:
         if os.path.lexists(plan.out / name):
             raise InputError(

@@ -278,6 +278,13 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, weights: Weights) -> None:
         # A worker process raises an error with its traceback, whose last line is the message.
         line = str(error).strip().splitlines()[-1]
         raise InputError(line.removeprefix(f"{InputError.__module__}.InputError: ")) from None
+    except RuntimeError as error:
+        if not str(error).startswith("DataLoader worker"):
+            raise
+        raise InputError(
+            "training.workers: expected processes that read scans to the end, found one that was "
+            "killed, as the system does if memory runs out; lower it, and go on with --resume"
+        ) from None
 
 
 def _callbacks(stage: Stage, plan: Plan, keep_weights: KeepWeights) -> list[Callback]:

@@ -11,6 +11,8 @@ from amvnet.progress import counted
 def check(data: str, /, choice: TrainingChoice) -> None:
     """Check the labels of all scans to train on, to validate with and to test on.
 
+    If too few sequences are there for a training, the labels of those are checked all the same.
+
     Args:
         data: the dataset.
         choice: which scans to check in addition to the labelled scans of the test split.
@@ -18,9 +20,18 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     from amvnet.cli.tables import contents_table, unknown_table
     from amvnet.data.check import check_scans
     from amvnet.data.datasets.open import open_dataset
+    from amvnet.inference.reading import described_sensor
 
     dataset = open_dataset(data)
-    splits = choice.splits(dataset)
+    described_sensor(dataset)
+    refused = None
+    try:
+        splits = choice.splits(dataset)
+    except InputError as error:
+        if choice != TrainingChoice():
+            raise
+        refused = error
+        splits = {"all": dataset.records(dataset.trainable())}
     with progress("checking") as step:
         checked = check_scans(dataset, splits, step)
 
@@ -44,5 +55,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
             "out",
             list(broken.values()),
         )
+    if refused is not None:
+        raise refused
     scans = sum(len(split.scans) for split in checked.splits.values())
     report(f"{counted(scans, 'scan')} can be trained on or scored")

@@ -137,7 +137,7 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
     raw_to_train: dict[int | str, int] = {}
     for train_id, (title, values) in enumerate(entries.items(), start=1):
         _check_keys(f"classes: {title}", values, ("ids", "color"), required=("ids",))
-        ids = _ids(f"classes: {title}", values["ids"])
+        ids = _ids(f"classes: {title}", values["ids"], least=0)
         if not ids:
             raise InputError(f"classes: {title}: expected ids, found none; name one or more")
         train_to_raw.append(ids[0])
@@ -147,7 +147,7 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
     entries_ignored = tree.get("ignored", [])
     if not isinstance(entries_ignored, list):
         entries_ignored = [entries_ignored]
-    ignored = _ids("ignored", [entry for entry in entries_ignored if entry != REST])
+    ignored = _ids("ignored", [entry for entry in entries_ignored if entry != REST], least=-1)
     for raw_id in ignored:
         _add(raw_to_train, raw_id, 0)
 
@@ -164,13 +164,13 @@ def _add(raw_to_train: dict[int | str, int], raw_id: int, train_id: int) -> None
     raw_to_train[raw_id] = train_id
 
 
-def _ids(title: str, values: Any) -> list[int]:
+def _ids(title: str, values: Any, least: int) -> list[int]:
     """Return raw ids; an id of -1, which many tools write for no label, becomes the largest id."""
     ids = []
     for raw_id in values if isinstance(values, list) else [values]:
-        if type(raw_id) is not int or not -1 <= raw_id <= INSTANCE_MASK:
+        if type(raw_id) is not int or not least <= raw_id <= INSTANCE_MASK:
             raise InputError(
-                f"{title}: expected whole numbers from -1 to {INSTANCE_MASK} as ids, "
+                f"{title}: expected whole numbers from {least} to {INSTANCE_MASK} as ids, "
                 f"found {shown(raw_id)}; correct them"
             )
         ids.append(raw_id & INSTANCE_MASK)

@@ -151,6 +151,12 @@ def _why_unusable(xyz: np.ndarray) -> str:
 
     distant = np.isfinite(xyz).all(axis=1) & (np.abs(xyz) >= FARTHEST).any(axis=1)
     if distant.any():
+        if (np.abs(xyz[distant, 1:]) < FARTHEST).all():
+            return (
+                f"expected metres from the sensor, found x from {xyz[distant, 0].min():.10g}, as "
+                "in a column of times before x; name the columns, for example --columns "
+                "_,x,y,z,intensity"
+            )
         return (
             f"expected metres from the sensor, found points farther than {FARTHEST / 1000:g} km, "
             "as in map coordinates; subtract the sensor's position x,y,z with --offset -x,-y,-z"

@@ -37,6 +37,13 @@ BEGINNINGS = {
     b"ARROW1": ".feather",
     b"\x1f\x8b": GZIP,
 }
+# What a file is that no reader takes, by its first bytes and by the end of its name.
+STRANGERS = {
+    b"\x89PNG\r\n": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"%PDF-": "a PDF document",
+}
+LABELS = (".label", "_lidarseg.bin", "_panoptic.npz")  # ends of names that the benchmarks write
 BEGINNING = 4096  # the bytes at the start of a file that may hold comments and its first bytes
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # may precede the header of a PCD file
 
@@ -59,6 +66,12 @@ def ending_of(path: Path) -> str:
         raise InputError(
             f"{path}: expected a file that can be read, found {error.strerror}; check it"
         ) from None
+
+    kinds = [kind for beginning, kind in STRANGERS.items() if head.startswith(beginning)]
+    if path.name.lower().endswith(LABELS):
+        kinds.append("labels")
+    for kind in kinds:
+        raise InputError(f"{path}: expected a scan file, found {kind}; give the file of the points")
 
     ending = _begins_as(head[:BEGINNING])
     named = named_ending(path)

@@ -224,6 +224,8 @@ def _folders_below(top: Path) -> list[Path]:
 
 def _advice_to_find(path: Path) -> str:
     """Return the advice for a folder without scans."""
+    if any(path.glob("*.label")):
+        return "it holds labels, give the folder of the points"
     for pattern in ("*/*", "*/*/*"):
         for deeper in sorted(path.glob(pattern)):
             if is_scan_file(deeper) and not deeper.parent.name.startswith("."):

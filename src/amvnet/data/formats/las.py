@@ -15,6 +15,9 @@ from amvnet.errors import InputError
 
 EXPECTED = "a LAS or LAZ file"
 ADVICE = "write the file again"
+CLASSIFICATION = "classification"
+FIRST_WIDE_FORMAT = 6  # the first point format whose classification has a byte of its own
+FLAGS = ("synthetic", "key_point", "withheld")  # the other bits of the byte in earlier formats
 CHUNK = 1_000_000  # the points that are read at a time
 
 
@@ -41,7 +44,15 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
             for key, index in chosen.items():
                 columns[key] = np.empty(count, "u2" if names[index] == "intensity" else "f8")
 
+            is_narrow = file.header.point_format.id < FIRST_WIDE_FORMAT
+            holds_classes = is_narrow and CLASSIFICATION in {names[i] for i in chosen.values()}
             for points in file.chunk_iterator(CHUNK):
+                if holds_classes and any(np.any(points[flag]) for flag in FLAGS):
+                    raise InputError(
+                        f"{path}: expected classes up to 31, the largest one in point format "
+                        f"{file.header.point_format.id}, found points with the bits of larger ones "
+                        "or with flags; write LAS 1.4 with point format 6"
+                    )
                 for key, values in columns.items():
                     values[done : done + len(points)] = points[names[chosen[key]]]
                 done += len(points)

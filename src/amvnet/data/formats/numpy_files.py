@@ -115,8 +115,14 @@ def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
 def member_names(path: Path) -> list[str]:
     """Return the names of the arrays in an archive; raise InputError if it is no archive."""
     with reading(path, "a NumPy archive", ARCHIVE_ADVICE), zipfile.ZipFile(path) as archive:
-        names = archive.namelist()
-        return [name.removesuffix(".npy") for name in names if name.endswith(".npy")]
+        names = [name for name in archive.namelist() if name.endswith(".npy")]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InputError(
+            f"{path}: expected each array once, found {twice[0]!a} {len(twice)} times; "
+            f"{ARCHIVE_ADVICE}"
+        )
+    return [name.removesuffix(".npy") for name in names]
 
 
 def read_array(path: Path, key: str | None = None) -> np.ndarray:

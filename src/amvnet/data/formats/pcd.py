@@ -107,10 +107,14 @@ def _read_compressed(
     packed_size, size = struct.unpack("<II", file.read(8))
     check_point_count(points, path, file.tell() + packed_size)
     expected = points * fields.record.itemsize
-    can_unpack = size * REPETITION_CODE <= packed_size * LONGEST_REPETITION
-    if size != expected or size > MAX_BYTES or not can_unpack:
+    if size != expected or size > MAX_BYTES:
         expected = min(expected, MAX_BYTES)
         raise InputError(f"{path}: expected {expected} bytes of points, found {size}; {ADVICE}")
+    if size * REPETITION_CODE > packed_size * LONGEST_REPETITION:
+        raise InputError(
+            f"{path}: expected {size} bytes of points, found {packed_size} packed ones, which "
+            f"cannot hold them; {ADVICE}"
+        )
 
     # The data hold one field after the other. In each, the values of a point are side by side.
     data = unpack_lzf(file.read(packed_size), size)

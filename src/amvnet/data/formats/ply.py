@@ -5,18 +5,21 @@ plyfile is not used: it allocates whatever memory a header claims, and is under 
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
+
+import numpy as np
 
 from amvnet.data.formats.cloud import Arrays, Names, check_point_count, reading, require_columns
 from amvnet.data.formats.fields import Fields, read_header_line
 from amvnet.errors import InputError
 
-# NumPy types by PLY's type names; each type has two names.
+# NumPy types by PLY's type names; most types have two names.
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("uchar", "uint8", "bool"), "u1"),
     **dict.fromkeys(("short", "int16"), "i2"),
     **dict.fromkeys(("ushort", "uint16"), "u2"),
     **dict.fromkeys(("int", "int32"), "i4"),
@@ -37,7 +40,8 @@ class Element:
         name: the name of the element.
         count: the number of rows.
         properties: the names of the properties.
-        types: the types of the properties; "list" for a list.
+        types: the types of the properties; "list", and the types of its length and of its items,
+            for a list.
     """
 
     name: str
@@ -49,6 +53,27 @@ class Element:
         """Return the fields of an element without lists, in the byte order "<" or ">"."""
         dtypes = [order + TYPES[kind] for kind in self.types]
         return Fields(self.properties, dtypes, [1] * len(dtypes))
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether the rows differ in length."""
+        return any(kind.startswith("list ") for kind in self.types)
+
+    def skip(self, file: BinaryIO, order: str) -> None:
+        """Move a binary file to the end of the element, which begins at its position."""
+        if not self.has_lists:
+            file.seek(self.count * self.fields(order).record.itemsize, os.SEEK_CUR)
+            return
+        for _ in range(self.count):
+            for kind in self.types:
+                *of_list, item = kind.removeprefix("list ").split()
+                length = 1
+                for name in of_list:
+                    dtype = np.dtype(order + TYPES[name])
+                    length = int(np.frombuffer(file.read(dtype.itemsize), dtype)[0])
+                    if length < 0:
+                        raise ValueError(f"a list of {length} items")
+                file.seek(length * np.dtype(TYPES[item]).itemsize, os.SEEK_CUR)
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
@@ -63,7 +88,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         before = elements[:index]
         vertex = elements[index]
 
-        if any("list" in element.types for element in elements[: index + 1]):
+        if vertex.has_lists:
             raise InputError(
                 f"{path}: expected vertices without lists, found a list; write the points alone"
             )
@@ -80,11 +105,10 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
                 file.readline()
             return fields.read_text(file, vertex.count, chosen, path)
 
-        start = file.tell()
         for element in before:
-            start += element.count * element.fields("<").record.itemsize
-        check_point_count(vertex.count, path, start + vertex.count * fields.record.itemsize)
-        file.seek(start)
+            element.skip(file, BYTE_ORDERS[encoding])
+        least = file.tell() + vertex.count * fields.record.itemsize
+        check_point_count(vertex.count, path, least)
         return fields.read_binary(file, vertex.count, chosen)
 
 
@@ -106,7 +130,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
             elements.append(element)
         elif keyword == "property":
             elements[-1].properties.append(words[-1])
-            elements[-1].types.append(words[1])
+            elements[-1].types.append(" ".join(words[1:-1]))
 
     if encoding not in BYTE_ORDERS:
         raise InputError(
