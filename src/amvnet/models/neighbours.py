@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 FREQUENT_TIES = 0.001  # largest share of queries with a tie that chance explains
 LEAF_SIZE = 32  # points in a leaf of pykdtree's trees, which take longer to build with fewer
@@ -127,6 +126,8 @@ def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
 
 def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
     """Return a search for the m nearest of points (P, 3), which reports no ties."""
+    from scipy.spatial import cKDTree
+
     # An unbalanced tree takes a third of the time to build, and a tenth more time to query.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
 
