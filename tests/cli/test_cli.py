@@ -483,6 +483,8 @@ def test_benchs_figures_add_up(
         medians[stage] = times["median"]
     mean = medians.pop("mean")  # the step of an ensemble, which has no fusion
     total = sum(medians.values())
+    # There is one gap more than timed steps, and each of both takes one tick.
+    assert medians["rest"] == pytest.approx(total / 2 + 0.5)
     assert 0 < mean < total
     assert total == pytest.approx(figures["all_ms"]["median"])
 

@@ -21,7 +21,7 @@ from amvnet.data.datasets.select import to_train
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.laser_order import lasers_by_order
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, drive_street, simulate, writing
@@ -32,7 +32,7 @@ from fixtures.tiny import fake_drive
 BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
 
 
-@pytest.fixture(params=simulated.CLASSES_BY_SENSOR)
+@pytest.fixture(params=CLASSES_BY_SENSOR)
 def sensor(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name

@@ -178,6 +178,15 @@ def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compa
     assert len(blocks.index) + in_blocks + in_all < 0.03 * len(xyz)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_neighbours_of_points_in_one_place_are_found_in_few_blocks(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(block_search, "_nearest_of_all", None)
+    crowd = torch.ones(20_000, 3, device=device)
+    check_nearest(crowd, torch.arange(0, 20_000, 40, device=device))
+
+
 def test_parts_of_little_memory_change_no_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = torch.randn(3000, 3)
     whole = nearest_others_by_blocks(xyz, torch.arange(500), N)

@@ -6,6 +6,8 @@ import errno
 import json
 import os
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -51,6 +53,21 @@ WEIGHTS = "w.safetensors"
 def predict(world: Path, out: Path, options: str = "") -> str:
     """Return the command that segments the lone scans."""
     return f"predict {world}/scans --weights {world}/{WEIGHTS} --out {out} {options}"
+
+
+def test_labelling_a_scan_imports_only_what_it_needs(world: Path, tmp_path: Path) -> None:
+    code = """
+import sys
+from amvnet.__main__ import main
+code = main()
+unneeded = {"lightning", "lidarstreets", "matplotlib", "onnxruntime", "scipy", "sympy"}
+print(code, unneeded & set(sys.modules))
+"""
+    command = f"predict {world}/lone.bin --weights {world}/{WEIGHTS} --out {tmp_path}/out"
+    process = subprocess.run(
+        [sys.executable, "-c", code, *command.split()], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.splitlines()[-1] == "0 set()"
 
 
 @pytest.fixture(scope="module")

@@ -10,17 +10,20 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.schema import PointHeadConfig
+from amvnet.models import neighbours
 from amvnet.models import point_head as point_head_module
 from amvnet.models.amvnet import LateFusion
 from amvnet.models.assertion import Disagreement
 from amvnet.models.layers import freeze
 from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
+from amvnet.models.neighbours import Query
 from amvnet.models.point_head import (
     head_features,
     nearest_neighbours,
@@ -107,10 +110,12 @@ def test_nearest_neighbours_equal_a_search_through_all_points() -> None:
 
 @pytest.mark.parametrize("n", [1, 3, 12])
 @pytest.mark.parametrize("places", [1, 4, 20])
+@pytest.mark.parametrize("crowd", [1, 256])
 @pytest.mark.usefixtures("tree")
 def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(
-    places: int, n: int
+    crowd: int, places: int, n: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(neighbours, "CROWD", crowd)
     positions = torch.randn(places, 4, generator=torch.Generator().manual_seed(0))
     points = positions[torch.arange(40) % places]
     for own, row in enumerate(nearest_neighbours(points, torch.arange(40), n).tolist()):
@@ -132,6 +137,41 @@ def test_among_equally_near_points_the_choice_does_not_depend_on_the_library(
     by_pykdtree = nearest_neighbours(points, index, 15)
     monkeypatch.setitem(sys.modules, "pykdtree.kdtree", None)
     assert torch.equal(nearest_neighbours(points, index, 15), by_pykdtree)
+
+
+@pytest.mark.parametrize("is_crowded", [True, False])
+@pytest.mark.usefixtures("tree")
+def test_a_search_gets_few_points_and_few_queries_of_one_place(
+    is_crowded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tree goes through all points in one place, once for each query there."""
+    points = torch.randn(900, 4, generator=torch.Generator().manual_seed(0))
+    if is_crowded:
+        points[50::2, :3] = 0.0
+        points[51::2, :3] = -0.0  # the same place
+    searched: list[np.ndarray] = []
+    queried: list[list[float]] = []
+
+    def recorded(make_query: Callable[..., Query]) -> Callable[..., Query]:
+        def make_recorded(xyz: np.ndarray, m: int) -> Query:
+            query = make_query(xyz, m)
+            searched.append(xyz)
+
+            def record(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+                queried.extend(queries.tolist())
+                return query(queries)
+
+            return record
+
+        return make_recorded
+
+    for name in ("_query_by_pykdtree", "_query_by_scipy"):
+        monkeypatch.setattr(neighbours, name, recorded(getattr(neighbours, name)))
+    nearest_neighbours(points, torch.arange(900), 3)
+
+    kept = 50 + neighbours.CROWD if is_crowded else 900
+    assert {len(xyz) for xyz in searched} == {kept}
+    assert kept <= len(queried) <= 2 * kept
 
 
 @pytest.mark.usefixtures("tree")

@@ -81,6 +81,8 @@ def test_a_point_linear_layer_is_a_linear_layer(rows: int, sizes: tuple[int, int
     output = layer(x)
     expected = F.linear(x, layer.weight, layer.bias)
     torch.testing.assert_close(output, expected)
+    with torch.inference_mode():
+        torch.testing.assert_close(layer(x), expected)
 
     gradient = torch.autograd.grad(output.square().sum(), x)[0]
     expected_gradient = torch.autograd.grad(expected.square().sum(), x)[0]

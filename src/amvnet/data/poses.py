@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from amvnet.errors import InputError
 
@@ -94,6 +93,8 @@ class Trajectory:
 
     def _within(self, times: NDArray[np.float64]) -> Poses:
         """Return the poses (M, 4, 4) at times from the first pose to the last one."""
+        from scipy.spatial.transform import Rotation, Slerp
+
         assert self.times is not None
         poses = np.tile(np.eye(4), (len(times), 1, 1))
         rotations = Slerp(self.times, Rotation.from_matrix(self.poses[:, :3, :3]))
@@ -155,6 +156,8 @@ def timed_poses(name: str, table: NDArray[np.float64]) -> Trajectory:
         InputError: if there is no pose, a quaternion has not the length 1, a value is no number, or
             the times do not ascend.
     """
+    from scipy.spatial.transform import Rotation
+
     quaternions = table[:, 4:]
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(quaternions, axis=1)

@@ -337,3 +337,5 @@ def _built_in() -> dict[str, Taxonomy]:
 TAXONOMIES: Mapping[str, Taxonomy] = _built_in()
 SEMANTICKITTI = TAXONOMIES["semantickitti"]
 NUSCENES = TAXONOMIES["nuscenes"]
+# The classes in the files that the simulator writes for each sensor.
+CLASSES_BY_SENSOR = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}

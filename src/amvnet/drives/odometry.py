@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from amvnet.data.poses import Poses
 from amvnet.errors import InputError
@@ -84,6 +83,8 @@ def check_fit(pairs: Iterable[Pair], name: str) -> None:
     Raises:
         InputError: if the poses do not fit.
     """
+    from scipy.spatial import KDTree
+
     distances = []
     for pair in pairs:
         before = _compared(pair.before)

@@ -46,7 +46,8 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
     """
     if text != SIMULATED:
         return _read(text, weights)
-    from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR, simulate
+    from amvnet.data.datasets.simulated import simulate
+    from amvnet.data.taxonomy import CLASSES_BY_SENSOR
 
     sensor = weights.sensor
     if sensor not in CLASSES_BY_SENSOR:

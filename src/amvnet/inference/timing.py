@@ -21,7 +21,8 @@ from amvnet.progress import Progress, no_progress
 from amvnet.runtime.memory import peak_memory
 from amvnet.scan import Scan
 
-STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")
+REST = "rest"  # all that is between the other stages
+STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write", REST)
 FUSION = ("compare", "neighbours", "head", "merge")
 MEAN = "mean"  # the stage of the ensemble, which takes the place of the fusion
 WARM_UP_RUNS = 2  # the number of first runs that do not count
@@ -85,6 +86,7 @@ def run_once(segmenter: Segmenter, read: Read, write: Write) -> Timing:
         write: writes its (P,) train ids.
     """
     clock = _Clock(segmenter.device)
+    start = time.perf_counter()
     with clock("read"):
         scan = read()
     with clock("project"):
@@ -97,6 +99,8 @@ def run_once(segmenter: Segmenter, read: Read, write: Write) -> Timing:
         labels = label_ids(scores.merged).cpu().numpy()
     with clock("write"):
         write(labels)
+    total = time.perf_counter() - start
+    clock.seconds[REST] = total - sum(clock.seconds.values())
 
     assert scores.rv is not None
     assert scores.bev is not None

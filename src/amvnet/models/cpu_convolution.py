@@ -23,25 +23,32 @@ def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, stride: Pair, paddi
     - Without gradients, for 1 x 1 kernels, `conv2d` calls MKL if it has one thread. MKL takes twice
       as long as oneDNN on an AMD processor. Here, oneDNN is called directly.
     """
-    # Under autocast, `conv2d` has to choose the type. An exporter has to see `conv2d`.
-    is_plain = (
-        x.is_cpu
-        and x.dtype == weight.dtype == torch.float32
-        and not torch.is_autocast_enabled("cpu")
-        and not torch.compiler.is_compiling()
-    )
-    if is_plain and torch.is_grad_enabled():
+    if not is_plain(x, weight):
+        return F.conv2d(x, weight, bias, stride, padding)
+
+    if torch.is_grad_enabled():
         is_avx2 = torch.backends.cpu.get_cpu_capability() == "AVX2"
         if is_avx2 and bias is None and weight.requires_grad:
             output: Tensor = _Convolution.apply(  # type: ignore[no-untyped-call]
                 x, weight, stride, padding
             )
             return output
-    elif is_plain and weight.shape[2:] == (1, 1) and torch.backends.mkldnn.is_available():
+    elif weight.shape[2:] == (1, 1) and torch.backends.mkldnn.is_available():
         return torch.mkldnn_convolution(
             x, weight, bias, padding=padding, stride=stride, dilation=(1, 1), groups=1
         )
     return F.conv2d(x, weight, bias, stride, padding)
+
+
+def is_plain(x: Tensor, weight: Tensor) -> bool:
+    """Return whether a layer computes in float32 on a CPU, so that other operations may do so."""
+    # Under autocast, torch's own operation has to choose the type. An exporter has to see it.
+    return (
+        x.is_cpu
+        and x.dtype == weight.dtype == torch.float32
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.compiler.is_compiling()
+    )
 
 
 class _Convolution(torch.autograd.Function):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
-from amvnet.models.cpu_convolution import convolve
+from amvnet.models.cpu_convolution import convolve, is_plain
 
 
 class RingConv2d(nn.Conv2d):
@@ -88,22 +88,14 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     """Apply a linear layer with weight (C', C) to rows: (N, C) -> (N, C').
 
     On a CPU, torch multiplies matrices with MKL, which leaves at least half of an AMD processor's
-    float32 performance unused. oneDNN, which computes convolutions, does not. So the layer is
-    computed as a 1 x 1 convolution, but only without gradients: the gradients of such a convolution
-    are slow.
+    float32 performance unused. oneDNN, which computes convolutions, does not. Without gradients, it
+    is called directly, by the operation that `torch.compile` puts in place of linear layers.
     """
     needs_gradient = torch.is_grad_enabled() and (x.requires_grad or weight.requires_grad)
-    # An exporter would make the number of rows a constant, so it must not see the convolution.
-    if torch.compiler.is_compiling() or needs_gradient or not x.is_cpu:
+    if needs_gradient or not is_plain(x, weight) or not torch.backends.mkldnn.is_available():
         return F.linear(x, weight, bias)
-    # A convolution does not take an empty image.
-    if not len(x):
-        return F.linear(x, weight, bias)
-
-    # (1, C, N, 1), with the channels last in memory
-    image = x.reshape(1, len(x), 1, x.shape[1]).permute(0, 3, 1, 2)
-    outputs = convolve(image, weight[:, :, None, None], bias, stride=(1, 1), padding=(0, 0))
-    return outputs.permute(0, 2, 3, 1).flatten(0, 2)
+    outputs: Tensor = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+    return outputs
 
 
 class ConvBlock(nn.Sequential):

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 FREQUENT_TIES = 0.001  # largest share of queries with a tie that chance explains
 LEAF_SIZE = 32  # points in a leaf of pykdtree's trees, which take longer to build with fewer
 QUERIES_AT_ONCE = 2**17  # number of queries answered at a time, which limits the memory
+CROWD = 256  # largest number of points in one place that a tree gets; nuScenes has about 70
+LINE = np.sqrt(np.array([2, 3, 5], dtype=np.float32))  # a direction in which few points are equal
 
 # Takes queries (Q, 3). Returns the indices (Q, m) of the m nearest points, and (Q,) bool: whether
 # another point is as near as the m-th (a tie).
@@ -26,11 +27,43 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     not depend on the installed library. (In real scans of nuScenes, a sixth of the points occur
     twice.)
 
+    A tree cannot divide points in one place: every search there goes through all of them. So the
+    tree gets `CROWD` of them. The others, such as a million lost returns, have the same neighbours.
+
     Args:
         xyz: (P, 3), all points of the scan, metres.
         own: (U,) indices of the points whose neighbours are wanted.
         n: number of neighbours of a point.
     """
+    most = max(CROWD, n + 2)  # a point, n neighbours, and one more point, which shows a tie
+    if not _may_have_crowds(xyz, most):
+        return _nearest_others(xyz, own, n)
+
+    order = np.lexsort(xyz.T)
+    ordered = xyz[order]
+    is_kept = np.ones(len(xyz), dtype=bool)
+    is_kept[most:] = (ordered[most:] != ordered[:-most]).any(axis=1)
+    kept = order[is_kept].astype(np.int32)
+
+    slot = np.empty(len(xyz), dtype=np.int64)  # each point, or the last one kept in its place
+    slot[order] = is_kept.cumsum() - 1
+    queries, rows = np.unique(slot[own], return_inverse=True)
+    nearest: np.ndarray = kept[_nearest_others(xyz[kept], queries, n)][rows]
+    return nearest
+
+
+def _may_have_crowds(xyz: np.ndarray, most: int) -> bool:
+    """Return False if no more than `most` of the points (P, 3) are in one place.
+
+    Points in one place have one position on a line. Others hardly ever do.
+    """
+    x, y, z = xyz.T
+    position = np.sort(x * LINE[0] + y * LINE[1] + z * LINE[2])
+    return bool((position[most:] == position[:-most]).any())
+
+
+def _nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
+    """Return the result of `nearest_others`, by a tree of all points."""
     nearest = np.empty((len(own), n), dtype=np.int32)
     if not len(own):
         return nearest
@@ -93,6 +126,8 @@ def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
 
 def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
     """Return a search for the m nearest of points (P, 3), which reports no ties."""
+    from scipy.spatial import cKDTree
+
     # An unbalanced tree takes a third of the time to build, and a tenth more time to query.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
 

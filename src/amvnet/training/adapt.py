@@ -14,7 +14,7 @@ import numpy as np
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR
+from amvnet.data.taxonomy import CLASSES_BY_SENSOR
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, inside, temporary_folder
 from amvnet.inference.drive import Drives, digest_of, key_of

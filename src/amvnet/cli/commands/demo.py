@@ -30,7 +30,8 @@ def demo(
         overwrite: replace the page and the scores if they exist.
     """
     from amvnet import load
-    from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR, simulate
+    from amvnet.data.datasets.simulated import simulate
+    from amvnet.data.taxonomy import CLASSES_BY_SENSOR
     from amvnet.errors import InputError
     from amvnet.evaluation.metrics import REPORT
     from amvnet.inference.listing import list_inputs

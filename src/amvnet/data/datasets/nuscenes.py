@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, not_trained_on
 from amvnet.data.formats.cloud import check_usable, ring_indices
@@ -199,6 +198,8 @@ class NuScenes(Dataset):
 
     def _motions(self, table: str) -> dict[str, Poses]:
         """Return the (4, 4) motions of a table by their tokens."""
+        from scipy.spatial.transform import Rotation
+
         rows = self._table(table)
         try:
             motions = np.tile(np.eye(4), (len(rows), 1, 1))

@@ -10,8 +10,7 @@ from amvnet.data.datasets.description import ENDINGS, is_description
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
-from amvnet.data.datasets.simulated import CLASSES_BY_SENSOR, SimulatedStreets
-from amvnet.data.taxonomy import Taxonomy, check_classes
+from amvnet.data.taxonomy import CLASSES_BY_SENSOR, Taxonomy, check_classes
 from amvnet.errors import InputError
 
 Reader = type[SemanticKitti] | type[NuScenes]
@@ -60,6 +59,8 @@ def _open(spec: str) -> Dataset:
     """Open a dataset with its own classes."""
     kind, _, rest = spec.partition(":")
     if kind in SIMULATED:
+        from amvnet.data.datasets.simulated import SimulatedStreets
+
         return SimulatedStreets(Path(os.path.expanduser(rest)), SIMULATED[kind])
     if _is_own(spec):
         return open_own(spec.removeprefix(f"{OWN}:"))

@@ -18,15 +18,13 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.formats.raw import FULL_INTENSITY
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError, one_line_errors, shown
 from amvnet.files import temporary_folder
 from amvnet.scan import Scan
 from lidarstreets import SimulationError, drive_street
 from lidarstreets import simulate as simulate_streets
 
-# The classes in the files that the simulator writes for each sensor.
-CLASSES_BY_SENSOR = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
 SCANS = 6  # number of scans of a street
 TRAIN_STREETS = {"hdl64e": 140, "hdl32e": 84}
 VAL_STREETS = 6
