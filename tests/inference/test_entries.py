@@ -21,6 +21,7 @@ from amvnet import onnx_runner
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData
+from amvnet.data.laser_order import lasers_by_order
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.evaluation.scoring import label_by_weights
 from amvnet.export.int8 import calibration_scans
@@ -60,7 +61,7 @@ classes: {classes}
 scans: "*.npy"
 labels: "{{name}}.label"
 """
-FIELDS = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4")])
+FIELDS = np.dtype([(name, "f4") for name in ("x", "y", "z", "intensity", "ring")])
 
 
 def plain() -> np.ndarray:
@@ -128,7 +129,7 @@ class World:
 
     def write_kitti(self, points: np.ndarray) -> Path:
         root = self.folder / "kitti"
-        path = write_scan(root, "08", "000000", points, np.zeros(len(points)))
+        path = write_scan(root, "08", "000000", points[:, :4], np.zeros(len(points)))
         return path.parents[3]
 
     def write_own(self, points: np.ndarray) -> Path:
@@ -160,13 +161,18 @@ def by_fields(world: World, points: np.ndarray) -> np.ndarray:
     table = np.zeros(len(points), FIELDS)
     for name, values in zip(FIELDS.names or (), points.T, strict=False):
         table[name] = values
-    return world.segmenter(table if points.shape[1] == 4 else table[["x", "y", "z"]]).labels
+    return world.segmenter(table[list(FIELDS.names or ())[: points.shape[1]]]).labels
 
 
 def by_scan(world: World, points: np.ndarray) -> np.ndarray:
+    return world.segmenter(scan_of(points)).labels
+
+
+def scan_of(points: np.ndarray) -> Scan:
+    """Return the scan of points (N, 3 to 5)."""
     table = np.zeros((len(points), 4), np.float32)
-    table[:, : points.shape[1]] = points
-    return world.segmenter(Scan(table)).labels
+    table[:, : points.shape[1]] = points[:, :4]
+    return Scan(table, ring=points[:, 4].astype(np.int64) if points.shape[1] == 5 else None)
 
 
 def by_many(world: World, points: np.ndarray) -> np.ndarray:
@@ -202,9 +208,7 @@ def by_evaluate(world: World, points: np.ndarray) -> np.ndarray:
 
 def by_node(world: World, points: np.ndarray) -> np.ndarray:
     """Label a message as the ROS node does."""
-    table = np.zeros((len(points), 4), np.float32)
-    table[:, : points.shape[1]] = points
-    message = cloud_message(get_typestore(Stores.ROS2_HUMBLE), table)
+    message = cloud_message(get_typestore(Stores.ROS2_HUMBLE), scan_of(points).points)
     label = CloudSegmenter(Settings(weights=str(world.weights)), "/lidar", lambda line: None)
     return SEMANTICKITTI.to_train(label(message).points.raw)
 
@@ -341,7 +345,27 @@ def black() -> np.ndarray:
     return in_order() * np.array([1, 1, 1, 0], np.float32)
 
 
-ODD = (in_order, shuffled, with_lost_returns, dark, a_little_too_bright, black)
+def with_rings(order: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return the scan with rings, which `order` makes of the right ones."""
+    ring = lasers_by_order(in_order(), 16)
+    assert ring is not None
+    return np.column_stack([in_order(), order(ring)])
+
+
+def with_reversed_rings() -> np.ndarray:
+    return with_rings(lambda ring: 15 - ring)
+
+
+def with_permuted_rings() -> np.ndarray:
+    return with_rings(lambda ring: np.random.default_rng(0).permutation(16)[ring])
+
+
+def with_rings_by_turns() -> np.ndarray:
+    return with_rings(lambda ring: np.arange(len(ring)) % 16)
+
+
+WITH_RINGS = (with_reversed_rings, with_permuted_rings, with_rings_by_turns)
+ODD = (in_order, shuffled, with_lost_returns, dark, a_little_too_bright, black, *WITH_RINGS)
 
 
 @contextmanager
@@ -418,18 +442,19 @@ def by_runner(world: World, points: np.ndarray) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(onnx_runner, "_open_graph", lambda *_: None)
         runner = BlindRunner(world.folder)
-    runner(points)
+    scan = scan_of(points)
+    runner(scan.points, scan.ring)
 
 
-@pytest.mark.parametrize("make", with_quick(ODD, (shuffled, with_lost_returns)))
+@pytest.mark.parametrize("make", with_quick(ODD, (shuffled, with_lost_returns, *WITH_RINGS[:1])))
 def test_every_entry_gives_the_networks_the_same_points_and_rows(
     by_laser: World, make: Callable[[], np.ndarray]
 ) -> None:
     points = make()
     with watched() as seen:
-        expected = by_list(by_laser, points)
+        expected = by_list(by_laser, points[:, :4])
     expected_points, expected_rows = seen[-1]
-    valid = Scan(points).valid
+    valid = scan_of(points).valid
     np.testing.assert_array_equal(expected_points[:, :3], points[valid, :3])
     if make is not black:
         found = np.quantile(expected_points[:, 3], PROBABILITIES)
@@ -437,13 +462,27 @@ def test_every_entry_gives_the_networks_the_same_points_and_rows(
 
     alone = (by_runner, by_fuse, by_training, by_calibration)
     for entry in (*IN_MEMORY, *OF_FILES, *OF_DATASETS, *alone):
-        with watched() as seen:
+        with watched() as seen, no_warnings():
             labels = entry(by_laser, points)
         seen_points, seen_rows = seen[-1]
         np.testing.assert_array_equal(seen_rows, expected_rows, entry.__name__)
         np.testing.assert_allclose(seen_points, expected_points, atol=1e-6, err_msg=entry.__name__)
         if labels is not None:
             assert (labels == expected).mean() > 0.995, entry.__name__
+
+
+@pytest.mark.parametrize("make", WITH_RINGS)
+def test_rings_that_are_not_in_order_are_said(
+    by_laser: World, make: Callable[[], np.ndarray]
+) -> None:
+    points = make()
+    for entry in (by_list, by_scan, by_runner):
+        with pytest.warns(UserWarning, match="the scan has rings"):
+            entry(by_laser, points)
+
+    result = by_laser.segmenter(by_laser.write(points))
+    assert result.origin is not None
+    assert ", rings " in result.origin.assumed
 
 
 OF_8_BITS = ("intensities in [0, 1]", "to 255", "divide")
