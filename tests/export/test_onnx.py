@@ -108,7 +108,7 @@ def make_scan(seed: int, count: int = POINTS) -> Scan:
     points[rng.integers(0, count, count // 50), 0] = np.nan
     points[rng.integers(0, count, count // 50), :3] *= 5
     points[-3:] = points[:3]
-    return Scan(points, ring=rings_of(points, 16))
+    return Scan(points, ring=rings_of(points, 32))
 
 
 @each_export

@@ -18,6 +18,7 @@ from amvnet.sensors.intensity import (
     SIMULATED_QUANTILES,
     TrainedIntensity,
     check_intensity,
+    fill_intensity,
     match_scan,
 )
 from amvnet.sensors.lasers import MEASURES, SensorGeometry
@@ -60,7 +61,8 @@ class Expectation:
     def prepare(self, scan: Scan) -> Scan:
         """Return a scan of N points as the networks take it, with the points in the same order.
 
-        Rings that do not ascend with the elevations are put in order or left out, with a warning.
+        Missing intensities are filled in. Rings that do not ascend with the elevations are put in
+        order or left out. A warning says so.
         If the rows of the range image are lasers, the lasers of a scan without rings are recovered
         from the order of its points. A few intensities outside [0, 1] are clipped. If the training
         matched the intensities of each scan to a distribution, so does this.
@@ -68,6 +70,9 @@ class Expectation:
         Raises:
             InputError: if more than a few intensities are out of range.
         """
+        scan, missing = fill_intensity(scan, self.intensity)
+        if missing:
+            warnings.warn(f"the scan has {missing}", stacklevel=2)
         if self.view.rows != "elevation" and scan.row is None:  # else the rows are known
             scan, fault = order_rings(scan)
             if fault:

@@ -17,7 +17,7 @@ from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.frame import Frame
-from amvnet.sensors.intensity import IntensityMap, intensity_map
+from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
 from amvnet.sensors.lasers import SensorGeometry, elevations
 from amvnet.sensors.lidars import Sensor, rotation_from_degrees
 from amvnet.sensors.measure import (
@@ -54,6 +54,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     intensity = to_intensity(cloud.intensity, len(cloud.xyz))
     height = expected.sensor.height
     seen, _ = seen_scan(cloud, estimate.frame, sensor, height, intensity)
+    seen, _ = fill_intensity(seen, expected.intensity)
     to_sensor, to_trained = estimate.frame.rises(sensor, height)
     moved = raise_points(seen, to_trained - to_sensor)
 
@@ -73,6 +74,7 @@ def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expecta
     assumed = [
         cloud.note,
         _intensity_map(cloud, estimate.quantiles, sensor, expected).text,
+        _describe_missing(cloud),
         _describe_negative(cloud),
         *_describe_frame(estimate.frame, sensor),
         _describe_height(estimate.frame, sensor, expected.sensor.height),
@@ -349,6 +351,15 @@ def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
             f"0,{frame.pitch:.1f},{frame.roll:.1f})"
         )
     return texts
+
+
+def _describe_missing(cloud: Cloud) -> str:
+    """Return in words how many points have no intensity although others have; empty if none."""
+    measured = cloud.measured_intensity()
+    count = np.count_nonzero(cloud.is_placed)
+    if measured is None or len(measured) == count:
+        return ""
+    return f"no intensity in {count - len(measured):,} of {count:,} points (the median instead)"
 
 
 def _describe_negative(cloud: Cloud) -> str:
