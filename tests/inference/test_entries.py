@@ -23,6 +23,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.laser_order import lasers_by_order
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.errors import InputError
 from amvnet.evaluation.scoring import label_by_weights
 from amvnet.export.int8 import calibration_scans
 from amvnet.export.onnx import describe_export, export
@@ -492,6 +493,32 @@ def test_every_entry_gives_the_networks_the_same_points_and_rows(
         np.testing.assert_allclose(seen_points, expected_points, atol=1e-6, err_msg=entry.__name__)
         if labels is not None:
             assert (labels == expected).mean() > 0.995, entry.__name__
+
+
+@pytest.mark.parametrize("kind", ["elevation", "laser", "ring"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_runner_takes_the_rows_and_rings_of_torch(kind: Any, seed: int) -> None:
+    """Also unknown ones, which are -1, and those of another sensor."""
+    view = replace(LASERS_VIEW, rows=kind)
+    rng = np.random.default_rng(seed)
+    points = plain()[:50]
+
+    def draw(lowest: int, end: int) -> np.ndarray | None:
+        return rng.integers(lowest, end, len(points)) if rng.random() < 0.8 else None
+
+    def rows_or_error(rows: Callable[[Scan], Any], scan: Scan) -> Any:
+        try:
+            return rows(scan).tolist()
+        except InputError as error:
+            return str(error)
+
+    for _ in range(50):
+        lowest, end = rng.choice([-1, 0]), rng.choice([16, 17])
+        scan = Scan(points, row=draw(lowest, 16), ring=draw(rng.choice([-1, 0]), end))
+        if rng.random() < 0.2:
+            scan = replace(scan, row=draw(lowest, end))
+        expected = rows_or_error(lambda each: RangeView(view).rows(PointBatch.of([each])), scan)
+        assert rows_or_error(partial(onnx_runner.image_rows, view), scan) == expected
 
 
 @pytest.mark.parametrize("make", WITH_RINGS)
