@@ -280,19 +280,33 @@ def scores_of_points(
 def image_rows(view: RangeViewConfig, scan: Scan) -> np.ndarray:
     """Return the (P,) rows of P finite points in the range image; 0 is the top row.
 
+    The scan's own rows take precedence over the rows of the view, as in `RangeView.rows`.
+
     Raises:
-        InputError: if the rows are rings, and the scan has no rings or a ring is out of range.
+        InputError: if a row is out of range; or if the rows are rings, and a point without a row
+            has no ring or one that is out of range.
     """
-    if scan.row is not None and (scan.row >= 0).all():
-        return scan.row
+    unknown = np.full(len(scan), -1)
+    own = unknown if scan.row is None else scan.row.astype(np.int64)
+    if own.max() >= view.height:
+        raise InputError(
+            f"expected rows from 0 to {view.height - 1}, found {own.max()}; "
+            "normalise the scan for these weights"
+        )
+    is_unknown = own < 0
+    if not is_unknown.any():
+        return own
+    ring = unknown if scan.ring is None else scan.ring.astype(np.int64)
     if view.rows == "ring":
-        return view.height - 1 - _check_rings(scan.ring, view.height)
-    if view.rows == "laser" and scan.ring is not None and view.has_laser_per_row(scan.ring.max()):
-        return view.height - 1 - scan.ring
+        _check_rings(ring[is_unknown], view.height)
+        return np.where(is_unknown, view.height - 1 - ring, own)
 
     x, y, z = scan.points[:, :3].astype(np.float64).T
     elevation = np.degrees(np.arctan2(z, np.sqrt(x * x + y * y)))
-    return _cells((view.fov_up - elevation) / (view.fov_up - view.fov_down), view.height)
+    rows = _cells((view.fov_up - elevation) / (view.fov_up - view.fov_down), view.height)
+    if view.rows == "laser" and view.has_laser_per_row(ring.max()):
+        rows = np.where(ring >= 0, view.height - 1 - ring, rows)
+    return np.where(is_unknown, rows, own)
 
 
 def distances(points: np.ndarray) -> np.ndarray:
@@ -360,20 +374,17 @@ def _cells(share: NDArray[np.floating], cells: int) -> NDArray[np.int64]:
     return nearest
 
 
-def _check_rings(ring: np.ndarray | None, height: int) -> np.ndarray:
-    if ring is None:
+def _check_rings(ring: np.ndarray, height: int) -> None:
+    """Raise InputError if one of the rings (P,) is unknown or out of range."""
+    if ring.min() < 0:
         raise InputError(
             "expected a scan with a ring index, found none; use a model with rows by elevation"
         )
-
-    low = ring.min()
-    high = ring.max()
-    if not 0 <= low <= high < height:
+    if ring.max() >= height:
         raise InputError(
-            f"expected ring indices from 0 to {height - 1}, found {low} to {high}; "
+            f"expected ring indices from 0 to {height - 1}, found {ring.min()} to {ring.max()}; "
             "use a model for this sensor"
         )
-    return ring.astype(np.int64)
 
 
 def _fill_in(values: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -22,8 +22,9 @@ class Scan:
 
     Attributes:
         points: (N, 4) float32: x, y, z in metres and intensity in [0, 1]. A row is a lost return if
-            a value is not finite, if a coordinate exceeds `FARTHEST`, or if the point is at the
-            origin, where sensors put lost returns. It keeps its place and gets the id 0.
+            a coordinate is not finite or exceeds `FARTHEST`, or if the point is at the origin,
+            where sensors put lost returns. It keeps its place and gets the id 0. An intensity that
+            is not finite is missing.
         labels: (N,) uint8 train ids (0 = ignored, 1..K), or None if there are no labels.
         ring: (N,) int64 index of the laser (0 = lowest, -1 = unknown), or None if the format has
             no lasers.
@@ -98,14 +99,14 @@ class Scan:
 
     @property
     def valid(self) -> np.ndarray:
-        """(N,) bool: whether a point is finite, within `FARTHEST`, and not at the origin."""
+        """(N,) bool: whether a point is at finite coordinates within `FARTHEST`, not the origin."""
         # Comparisons with NaN are false.
         if np.abs(self.points).max(initial=0) < FARTHEST:
             valid = np.ones(len(self.points), dtype=bool)
         else:
             # A reduction over rows of four would take ten times as long as these columns.
-            x, y, z, intensity = np.abs(self.points.T)
-            valid = (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST) & (intensity < np.inf)
+            x, y, z = np.abs(self.points.T[:3])
+            valid = (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST)
 
         valid[at_origin(self.points)] = False
         return valid

@@ -1,4 +1,4 @@
-"""The laser of each point, from the order of the points in a file."""
+"""The laser of each point, from its ring or from the order of the points in a file."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from amvnet.config.schema import RangeViewConfig
-from amvnet.data.laser_order import lasers_by_order
+from amvnet.data.laser_order import lasers_by_order, order_rings
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.lidars import rotation_from_degrees
 
 LASERS = 16
 SHOTS = 200
@@ -78,13 +79,57 @@ def test_turns_that_do_not_keep_to_an_elevation_are_no_lasers() -> None:
 
 def test_known_rings_stay() -> None:
     points, ring = turns()
-    others = np.zeros_like(ring)
     expects = Expectation(RangeViewConfig(rows="laser", height=LASERS))
-    assert expects.prepare(Scan(points, ring=others)).ring is others
+    assert expects.prepare(Scan(points, ring=ring)).ring is ring
     assert Expectation().prepare(Scan(points)).ring is None
     found = expects.prepare(Scan(points)).ring
     assert found is not None
     assert np.array_equal(found, ring)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 15.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_rings_in_any_order_become_the_lasers(seed: int, tilt: float) -> None:
+    points, laser = turns(seed)
+    points[:, :3] = points[:, :3] @ rotation_from_degrees(0, tilt, tilt / 2).T
+    other = np.random.default_rng(seed).permutation(LASERS)
+    unknown = np.arange(len(points)) % 10 == 0
+    names = {"highest": LASERS - 1 - laser, "order": other[laser], "another": laser ^ 1}
+    for word, ring in names.items():
+        scan, fault = order_rings(Scan(points, ring=np.where(unknown, -1, ring)))
+        np.testing.assert_array_equal(scan.ring, np.where(unknown, -1, laser))
+        assert word in fault
+
+    for ring in (laser, np.where(unknown, -1, laser), laser // 2, 3 * laser):
+        scan = Scan(points, ring=ring)
+        assert order_rings(scan) == (scan, "")
+
+
+def test_the_lowest_laser_is_the_last_ring_although_the_highest_see_nothing() -> None:
+    points, laser = turns()
+    seen = laser < LASERS - 3
+    scan, _ = order_rings(Scan(points[seen], ring=LASERS - 1 - laser[seen]))
+    np.testing.assert_array_equal(scan.ring, laser[seen])
+
+
+def test_rings_that_do_not_follow_the_elevations_are_left_out() -> None:
+    points, laser = turns()
+    rng = np.random.default_rng(0)
+    for ring in (
+        np.arange(len(points)) % LASERS,
+        rng.integers(0, LASERS, len(points)),
+        np.where(rng.random(len(points)) < 0.5, laser, rng.integers(0, LASERS, len(points))),
+    ):
+        scan, fault = order_rings(Scan(points, ring=ring))
+        assert scan.ring is None
+        assert "not used" in fault
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 15])
+def test_a_few_points_keep_their_rings(count: int) -> None:
+    points, laser = turns()
+    scan = Scan(points[:count], ring=laser[:count])
+    assert order_rings(scan) == (scan, "")
 
 
 @pytest.mark.skipif("AMVNET_REAL_DATA" not in os.environ, reason="needs real scans")

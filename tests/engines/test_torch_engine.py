@@ -28,6 +28,7 @@ from amvnet.weights.file import Weights
 from lidarstreets import simulate
 
 from fixtures.engines import scripted, sure_of
+from fixtures.sensors import rings_of
 from fixtures.tiny import fresh_weights, street
 
 PART = 2000  # uncertain points that the plain model classifies at a time
@@ -124,7 +125,7 @@ def share_of_equal_labels(weights: str | Weights, scan: Scan) -> float:
 @pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES], ids=lambda each: each.name)
 def test_what_makes_a_small_model_fast_leaves_the_labels_as_they_are(taxonomy: Taxonomy) -> None:
     points = street(0, 4000)[0]
-    scan = Scan(points, ring=np.arange(len(points)) % 32)
+    scan = Scan(points, ring=rings_of(points, 32))
     assert share_of_equal_labels(fresh_weights(taxonomy), scan) >= 0.9999
 
 

@@ -46,6 +46,7 @@ from fixtures.commands import (
 from fixtures.examples import first_of
 from fixtures.exports import shallow_weights
 from fixtures.pages import DocsPage
+from fixtures.sensors import rings_of
 from fixtures.tiny import fresh_weights, street, with_intensities, without
 
 PROJECT = Path(__file__).parents[2]
@@ -107,7 +108,7 @@ def make_scan(seed: int, count: int = POINTS) -> Scan:
     points[rng.integers(0, count, count // 50), 0] = np.nan
     points[rng.integers(0, count, count // 50), :3] *= 5
     points[-3:] = points[:3]
-    return Scan(points, ring=rng.integers(0, 16, count))
+    return Scan(points, ring=rings_of(points, 32))
 
 
 @each_export

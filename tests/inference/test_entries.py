@@ -21,7 +21,9 @@ from amvnet import onnx_runner
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData
+from amvnet.data.laser_order import lasers_by_order
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.errors import InputError
 from amvnet.evaluation.scoring import label_by_weights
 from amvnet.export.int8 import calibration_scans
 from amvnet.export.onnx import describe_export, export
@@ -60,7 +62,7 @@ classes: {classes}
 scans: "*.npy"
 labels: "{{name}}.label"
 """
-FIELDS = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4")])
+FIELDS = np.dtype([(name, "f4") for name in ("x", "y", "z", "intensity", "ring")])
 
 
 def plain() -> np.ndarray:
@@ -84,6 +86,13 @@ def with_intensity(value: float, index: int = 700) -> np.ndarray:
     return points
 
 
+def without_intensities(share: float) -> np.ndarray:
+    """Return the scan with NaN in the place of some intensities."""
+    points = plain()
+    points[np.random.default_rng(0).random(len(points)) < share, 3] = np.nan
+    return points
+
+
 DARK = [0.0, 0.0, 0.0, -1.0]
 BRIGHT = [0.0, 0.0, 0.0, 65535.0]
 LOST: dict[str, list[float]] = {
@@ -92,8 +101,6 @@ LOST: dict[str, list[float]] = {
     "not a number": [np.nan, np.nan, np.nan, 0],
     "infinite": [np.inf, -np.inf, np.inf, 0],
     "infinite in one coordinate": [3, np.inf, 1, 0.5],
-    "of an infinite intensity": [3, 2, 1, np.inf],
-    "of no intensity": [3, 2, 1, np.nan],
     "far away": [1e20, 1, 1, 0.5],
 }
 SCANS: dict[str, Callable[[], np.ndarray]] = {
@@ -104,6 +111,9 @@ SCANS: dict[str, Callable[[], np.ndarray]] = {
     "lost returns of a huge intensity": lambda: with_rows(*[BRIGHT] * 300),
     "an intensity a little too large": lambda: with_intensity(1.0001),
     "an intensity a little too small": lambda: with_intensity(-0.0001),
+    "an infinite intensity": lambda: with_intensity(np.inf),
+    "a tenth of the intensities missing": lambda: without_intensities(0.1),
+    "nearly all intensities missing": lambda: without_intensities(0.999),
     "on an axis": lambda: with_rows([0, 0, -1.7, 0.5], [0, 5, 0, 0.5], [5, 0, 0, 0.5]),
     "without intensities": lambda: plain()[:, :3],
     "in double precision": lambda: plain().astype(np.float64),
@@ -128,7 +138,7 @@ class World:
 
     def write_kitti(self, points: np.ndarray) -> Path:
         root = self.folder / "kitti"
-        path = write_scan(root, "08", "000000", points, np.zeros(len(points)))
+        path = write_scan(root, "08", "000000", points[:, :4], np.zeros(len(points)))
         return path.parents[3]
 
     def write_own(self, points: np.ndarray) -> Path:
@@ -160,13 +170,18 @@ def by_fields(world: World, points: np.ndarray) -> np.ndarray:
     table = np.zeros(len(points), FIELDS)
     for name, values in zip(FIELDS.names or (), points.T, strict=False):
         table[name] = values
-    return world.segmenter(table if points.shape[1] == 4 else table[["x", "y", "z"]]).labels
+    return world.segmenter(table[list(FIELDS.names or ())[: points.shape[1]]]).labels
 
 
 def by_scan(world: World, points: np.ndarray) -> np.ndarray:
+    return world.segmenter(scan_of(points)).labels
+
+
+def scan_of(points: np.ndarray) -> Scan:
+    """Return the scan of points (N, 3 to 5)."""
     table = np.zeros((len(points), 4), np.float32)
-    table[:, : points.shape[1]] = points
-    return world.segmenter(Scan(table)).labels
+    table[:, : points.shape[1]] = points[:, :4]
+    return Scan(table, ring=points[:, 4].astype(np.int64) if points.shape[1] == 5 else None)
 
 
 def by_many(world: World, points: np.ndarray) -> np.ndarray:
@@ -202,9 +217,7 @@ def by_evaluate(world: World, points: np.ndarray) -> np.ndarray:
 
 def by_node(world: World, points: np.ndarray) -> np.ndarray:
     """Label a message as the ROS node does."""
-    table = np.zeros((len(points), 4), np.float32)
-    table[:, : points.shape[1]] = points
-    message = cloud_message(get_typestore(Stores.ROS2_HUMBLE), table)
+    message = cloud_message(get_typestore(Stores.ROS2_HUMBLE), scan_of(points).points)
     label = CloudSegmenter(Settings(weights=str(world.weights)), "/lidar", lambda line: None)
     return SEMANTICKITTI.to_train(label(message).points.raw)
 
@@ -281,18 +294,19 @@ def test_every_entry_gives_a_scan_the_same_labels(saved: World, name: str) -> No
 
 def is_lost(points: np.ndarray) -> np.ndarray:
     """Return which points of a scan are lost returns."""
-    table = points.astype(np.float32)
-    lost = ~np.isfinite(table).all(axis=1) | (table[:, :3] == 0).all(axis=1)
-    return lost | (np.abs(table[:, :3]) > 1e4).any(axis=1)
+    xyz = points[:, :3].astype(np.float32)
+    lost = ~np.isfinite(xyz).all(axis=1) | (xyz == 0).all(axis=1)
+    return lost | (np.abs(xyz) > 1e4).any(axis=1)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", [name for name in SCANS if name != "without intensities"])
 def test_the_onnx_runner_gives_a_scan_the_same_labels(runner: OnnxSegmenter, name: str) -> None:
     points = SCANS[name]()
-    labels = runner(points).labels
+    with no_warnings():
+        labels = runner(points).labels
+        expected = amvnet.load(WEIGHTS, method="rv")(points).labels
     np.testing.assert_array_equal(labels == 0, is_lost(points))
-    expected = amvnet.load(WEIGHTS, method="rv")(points).labels
     assert (labels == expected).mean() > 0.995
 
 
@@ -323,6 +337,11 @@ def shuffled() -> np.ndarray:
 def with_lost_returns() -> np.ndarray:
     points = in_order()
     points[::50, :3] = 0
+    return points
+
+
+def with_missing_intensities() -> np.ndarray:
+    points = in_order()
     points[7::90, 3] = np.nan
     return points
 
@@ -341,7 +360,36 @@ def black() -> np.ndarray:
     return in_order() * np.array([1, 1, 1, 0], np.float32)
 
 
-ODD = (in_order, shuffled, with_lost_returns, dark, a_little_too_bright, black)
+def with_rings(order: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return the scan with rings, which `order` makes of the right ones."""
+    ring = lasers_by_order(in_order(), 16)
+    assert ring is not None
+    return np.column_stack([in_order(), order(ring)])
+
+
+def with_reversed_rings() -> np.ndarray:
+    return with_rings(lambda ring: 15 - ring)
+
+
+def with_permuted_rings() -> np.ndarray:
+    return with_rings(lambda ring: np.random.default_rng(0).permutation(16)[ring])
+
+
+def with_rings_by_turns() -> np.ndarray:
+    return with_rings(lambda ring: np.arange(len(ring)) % 16)
+
+
+WITH_RINGS = (with_reversed_rings, with_permuted_rings, with_rings_by_turns)
+ODD = (
+    in_order,
+    shuffled,
+    with_lost_returns,
+    with_missing_intensities,
+    dark,
+    a_little_too_bright,
+    black,
+    *WITH_RINGS,
+)
 
 
 @contextmanager
@@ -418,18 +466,19 @@ def by_runner(world: World, points: np.ndarray) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(onnx_runner, "_open_graph", lambda *_: None)
         runner = BlindRunner(world.folder)
-    runner(points)
+    scan = scan_of(points)
+    runner(scan.points, scan.ring)
 
 
-@pytest.mark.parametrize("make", with_quick(ODD, (shuffled, with_lost_returns)))
+@pytest.mark.parametrize("make", with_quick(ODD, (shuffled, with_lost_returns, *WITH_RINGS[:1])))
 def test_every_entry_gives_the_networks_the_same_points_and_rows(
     by_laser: World, make: Callable[[], np.ndarray]
 ) -> None:
     points = make()
-    with watched() as seen:
-        expected = by_list(by_laser, points)
+    with watched() as seen, no_warnings():
+        expected = by_list(by_laser, points[:, :4])
     expected_points, expected_rows = seen[-1]
-    valid = Scan(points).valid
+    valid = scan_of(points).valid
     np.testing.assert_array_equal(expected_points[:, :3], points[valid, :3])
     if make is not black:
         found = np.quantile(expected_points[:, 3], PROBABILITIES)
@@ -437,13 +486,53 @@ def test_every_entry_gives_the_networks_the_same_points_and_rows(
 
     alone = (by_runner, by_fuse, by_training, by_calibration)
     for entry in (*IN_MEMORY, *OF_FILES, *OF_DATASETS, *alone):
-        with watched() as seen:
+        with watched() as seen, no_warnings():
             labels = entry(by_laser, points)
         seen_points, seen_rows = seen[-1]
         np.testing.assert_array_equal(seen_rows, expected_rows, entry.__name__)
         np.testing.assert_allclose(seen_points, expected_points, atol=1e-6, err_msg=entry.__name__)
         if labels is not None:
             assert (labels == expected).mean() > 0.995, entry.__name__
+
+
+@pytest.mark.parametrize("kind", ["elevation", "laser", "ring"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_runner_takes_the_rows_and_rings_of_torch(kind: Any, seed: int) -> None:
+    """Also unknown ones, which are -1, and those of another sensor."""
+    view = replace(LASERS_VIEW, rows=kind)
+    rng = np.random.default_rng(seed)
+    points = plain()[:50]
+
+    def draw(lowest: int, end: int) -> np.ndarray | None:
+        return rng.integers(lowest, end, len(points)) if rng.random() < 0.8 else None
+
+    def rows_or_error(rows: Callable[[Scan], Any], scan: Scan) -> Any:
+        try:
+            return rows(scan).tolist()
+        except InputError as error:
+            return str(error)
+
+    for _ in range(50):
+        lowest, end = rng.choice([-1, 0]), rng.choice([16, 17])
+        scan = Scan(points, row=draw(lowest, 16), ring=draw(rng.choice([-1, 0]), end))
+        if rng.random() < 0.2:
+            scan = replace(scan, row=draw(lowest, end))
+        expected = rows_or_error(lambda each: RangeView(view).rows(PointBatch.of([each])), scan)
+        assert rows_or_error(partial(onnx_runner.image_rows, view), scan) == expected
+
+
+@pytest.mark.parametrize("make", WITH_RINGS)
+def test_rings_that_are_not_in_order_are_said(
+    by_laser: World, make: Callable[[], np.ndarray]
+) -> None:
+    points = make()
+    for entry in (by_list, by_scan, by_runner):
+        with pytest.warns(UserWarning, match="the scan has rings"):
+            entry(by_laser, points)
+
+    result = by_laser.segmenter(by_laser.write(points))
+    assert result.origin is not None
+    assert ", rings " in result.origin.assumed
 
 
 OF_8_BITS = ("intensities in [0, 1]", "to 255", "divide")
@@ -476,23 +565,34 @@ def test_negative_intensities_are_named_with_their_number(saved: World) -> None:
 
 
 @pytest.mark.parametrize("value", with_full([np.nan, np.inf], [np.inf]))
-def test_intensities_that_are_all_lost_are_none(saved: World, value: float) -> None:
+@pytest.mark.parametrize("share", with_full([1.0, 0.999, 0.6], [0.6]))
+def test_intensities_of_which_most_are_missing_are_none(
+    saved: World, value: float, share: float
+) -> None:
     points = plain()
-    points[:, 3] = value
+    points[: round(share * len(points)), 3] = value
     with no_warnings():
         expected = saved.segmenter(points[:, :3]).labels
-        for entry in (by_list, by_tensor, by_fields, *OF_FILES):
-            assert np.array_equal(entry(saved, points), expected), entry.__name__
+        for entry in (*IN_MEMORY, *OF_FILES, *OF_DATASETS):
+            assert (entry(saved, points) == expected).mean() > 0.995, entry.__name__
 
 
-OF_PLACES = [name for name in LOST if "intensity" not in name]
+def test_missing_intensities_are_counted(saved: World) -> None:
+    points = without_intensities(0.1)
+    with pytest.warns(UserWarning, match="no intensity in 1[012] % of the points"):
+        saved.segmenter(points)
+    result = saved.segmenter(saved.write(points))
+    assert result.origin is not None
+    assert (
+        f"no intensity in {np.isnan(points[:, 3]).sum()} of 1,500 points" in result.origin.assumed
+    )
 
 
 def of_lost_returns(name: str) -> np.ndarray:
     return np.array([LOST[name]] * 100, np.float32)
 
 
-@pytest.mark.parametrize("name", with_quick(OF_PLACES, ["at the origin", "not a number"]))
+@pytest.mark.parametrize("name", with_quick(LOST, ["at the origin", "not a number"]))
 def test_a_scan_of_lost_returns_alone_is_refused_by_every_entry(saved: World, name: str) -> None:
     points = of_lost_returns(name)
     fails(partial(saved.segmenter, points), "expected points to segment")
@@ -504,5 +604,5 @@ def test_a_scan_of_lost_returns_alone_is_refused_by_every_entry(saved: World, na
 def test_the_onnx_runner_refuses_what_the_segmenter_refuses(runner: OnnxSegmenter) -> None:
     fails(partial(runner, with_intensities_of_8_bits()), *OF_8_BITS)
     fails(partial(runner, with_negative_intensities()), *OF_LOST_RETURNS)
-    for name in OF_PLACES:
+    for name in LOST:
         fails(partial(runner, of_lost_returns(name)), "expected points to segment")

@@ -21,6 +21,7 @@ from amvnet.models.methods import METHODS, MethodName
 from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails
+from fixtures.sensors import rings_of
 from fixtures.tiny import (
     THRESHOLD,
     fresh_weights,
@@ -431,7 +432,7 @@ def test_rows_by_ring_need_a_ring() -> None:
     segmenter = amvnet.load(fresh_weights(NUSCENES))
     with pytest.raises(InputError, match="ring"):
         segmenter(POINTS)
-    ring = np.arange(len(POINTS)) % 32
+    ring = rings_of(POINTS, 32)
     assert segmenter(Scan(POINTS, ring=ring)).labels.max() <= 16
 
 
@@ -455,8 +456,8 @@ def test_the_rows_of_a_scan_take_precedence_over_its_elevations_and_rings() -> N
     for weights in (WEIGHTS, fresh_weights(NUSCENES)):
         segmenter = amvnet.load(weights)
         height = weights.model.range_view.height
-        ring = np.random.default_rng(0).integers(0, height, len(POINTS))
-        others = np.random.default_rng(1).integers(0, height, len(POINTS))
+        ring = rings_of(POINTS, height)
+        others = ring // 2
         by_ring = segmenter_by_ring(weights)(Scan(POINTS, ring=ring)).scores
         assert by_ring is not None
 
@@ -475,7 +476,7 @@ def test_scans_with_rows_and_without_go_through_the_networks_together() -> None:
     segmenter = amvnet.load(WEIGHTS)
     height = WEIGHTS.model.range_view.height
     row = np.random.default_rng(0).integers(0, height, len(POINTS))
-    scans = [Scan(POINTS), Scan(POINTS, row=row), Scan(POINTS, ring=row)]
+    scans = [Scan(POINTS), Scan(POINTS, row=row), Scan(POINTS, ring=rings_of(POINTS, height))]
     for scan, result in zip(scans, segmenter.many(scans), strict=True):
         np.testing.assert_allclose(result.scores, segmenter(scan).scores, atol=1e-5)
 

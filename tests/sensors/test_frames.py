@@ -134,6 +134,24 @@ def test_map_coordinates_are_not_taken_for_millimetres() -> None:
     assert find_frame(xyz, Sensor()).unit == "m"
 
 
+def test_the_height_is_that_over_the_ground_under_the_car() -> None:
+    """Most of the ground may lie lower than the road, as beside a dam."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-25, 25, (2, 20_000))
+    z = np.where(np.abs(y) < 5, -1.73, -2.1) + rng.normal(0, 0.02, len(x))
+    frame = find_frame(np.column_stack([x, y, z]), Sensor())
+    assert frame.height == pytest.approx(1.73, abs=0.1)
+
+
+def test_a_bank_of_which_little_is_seen_moves_no_scan() -> None:
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-25, 25, (2, 20_000))
+    bushes = rng.uniform(0.2, 2, len(x)) * (rng.random(len(x)) < 0.85)
+    _, line = normalise(np.column_stack([x, y, 0.2 * y - 2.5 + bushes]))
+    assert "no ground" in line
+    assert "moved" not in line
+
+
 def test_the_walls_of_a_corridor_are_not_taken_for_the_ground() -> None:
     rng = np.random.default_rng(0)
     x = rng.uniform(-20, 20, 20_000)

@@ -236,10 +236,12 @@ def test_rows_by_elevation_reach_half_a_row_beyond_the_lasers() -> None:
     assert (chosen.fov_up, chosen.fov_down) == (20 + half, -20 - half)
 
 
-@pytest.mark.parametrize("kind", ["none", "right", "reversed"])
+@pytest.mark.parametrize("kind", ["none", "right", "reversed", "in pairs", "random"])
 def test_weights_with_rings_as_rows_get_the_rows_of_the_training(kind: str) -> None:
     points, laser = place(LASERS["hdl32e"], 1.84)
-    rings = {"none": None, "right": laser, "reversed": 31 - laser}
+    random = np.random.default_rng(0).integers(0, 32, len(laser))
+    rings = {"none": None, "right": laser, "reversed": 31 - laser, "in pairs": laser ^ 1}
+    rings["random"] = random
     normaliser, _ = make_normaliser(name="hdl32e", is_nuscenes=True)
     scan = normaliser(make_cloud(points, rings[kind]), "a")
     np.testing.assert_array_equal(rows_in_nuscenes(scan), 31 - laser)
@@ -260,9 +262,9 @@ def test_weights_of_an_unknown_sensor_get_rows_if_the_number_of_lasers_fits() ->
         if row is not None:
             np.testing.assert_array_equal(row, 31 - laser)
 
-    # Rings that the file has are taken as they are.
-    scan = normaliser(make_cloud(points, 31 - laser), "c")
-    np.testing.assert_array_equal(rows_in_nuscenes(scan), laser)
+    for ring in (laser, 31 - laser):
+        scan = normaliser(make_cloud(points, ring), "c")
+        np.testing.assert_array_equal(rows_in_nuscenes(scan), 31 - laser)
 
 
 def test_what_was_assumed_is_said_once_for_a_source() -> None:

@@ -31,6 +31,7 @@ from amvnet.onnx_runner import (
 )
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.lidars import rotation_from_degrees
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import load
 
@@ -177,6 +178,32 @@ def of_fewer_lasers(folder: Path) -> Case:
     return Case(path, "sim-hdl32e", rows="ring")
 
 
+def with_rings_from_the_highest(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    path = write_bin(folder / "reversed.pcd.bin", with_ring(points, 31 - laser))
+    return Case(path, "sim-hdl32e", rows="ring")
+
+
+def with_permuted_rings(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    order = np.random.default_rng(0).permutation(32)
+    path = write_bin(folder / "permuted.pcd.bin", with_ring(points, order[laser]))
+    return Case(path, "sim-hdl32e", rows="laser")
+
+
+def with_random_rings(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    ring = np.random.default_rng(0).integers(0, 32, len(laser))
+    return Case(write_bin(folder / "random.pcd.bin", with_ring(points, ring)), "sim-hdl32e")
+
+
+def tilted_in_order(folder: Path) -> Case:
+    case = kitti_like(folder)
+    points = np.fromfile(case.file, np.float32).reshape(-1, 4)
+    points[:, :3] = points[:, :3] @ rotation_from_degrees(0, 14, 0)
+    return Case(write_bin(case.file, points), rows="laser")
+
+
 def without_rings(folder: Path) -> Case:
     points, _ = place(LASERS["hdl32e"], 1.84, steps=700)
     return Case(write_bin(folder / "lone32.bin", points), "sim-hdl32e", rows="ring")
@@ -184,9 +211,7 @@ def without_rings(folder: Path) -> Case:
 
 def tilted(folder: Path) -> Case:
     points, _ = place(HDL64E, 1.73)
-    angle = np.radians(14)
-    turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    points[:, :3] = points[:, :3] @ np.array(turn)
+    points[:, :3] = points[:, :3] @ rotation_from_degrees(0, 14, 0)
     return Case(write_bin(folder / "tilted.bin", points))
 
 
@@ -215,6 +240,24 @@ def on_a_mound(folder: Path) -> Case:
     return Case(write_bin(folder / "mound.bin", points))
 
 
+def on_a_hump(folder: Path) -> Case:
+    """The ground is 0.3 m lower from 6 m on, where most of it lies."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-25, 25, (2, 20_000))
+    z = np.where(np.hypot(x, y) < 6, -1.4, -1.7) + 1.5 * (rng.random(len(x)) < 0.2)
+    points = np.column_stack([x, y, z, rng.random(len(x))])
+    return Case(write_bin(folder / "hump.bin", points))
+
+
+def on_a_bank(folder: Path) -> Case:
+    """The ground hardly shows under bushes, so that its slope is unsure."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-25, 25, (2, 20_000))
+    z = 0.2 * y - 2.5 + rng.uniform(0.2, 2, len(x)) * (rng.random(len(x)) < 0.85)
+    points = np.column_stack([x, y, z, rng.random(len(x))])
+    return Case(write_bin(folder / "bank.bin", points))
+
+
 def without_a_ground(folder: Path) -> Case:
     return Case(write_bin(folder / "few.bin", some_points(4000)))
 
@@ -235,6 +278,14 @@ def with_odd_intensities(folder: Path) -> Case:
     return Case(write_bin(folder / "odd.bin", points))
 
 
+def of_missing_intensities(folder: Path) -> Case:
+    case = bright(folder)
+    points = np.fromfile(case.file, np.float32).reshape(-1, 4)
+    points[::2, 3] = np.nan
+    points[1, 3] = np.nan
+    return Case(write_bin(folder / "missing.bin", points))
+
+
 def bright(folder: Path) -> Case:
     points, _ = place(HDL64E, 1.73)
     points[:, 3] = np.round(points[:, 3] ** 4 * 60_000)
@@ -250,14 +301,21 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     higher_with_lost_returns,
     of_another_sensor,
     of_fewer_lasers,
+    with_rings_from_the_highest,
+    with_permuted_rings,
+    with_random_rings,
     without_rings,
     tilted,
+    tilted_in_order,
     with_y_up_in_millimetres,
     on_the_ground,
     on_a_mound,
+    on_a_hump,
+    on_a_bank,
     without_a_ground,
     without_intensity,
     with_odd_intensities,
+    of_missing_intensities,
     bright,
 )
 

@@ -9,6 +9,7 @@ import { counted, InputError, quoted } from "../errors.js";
 
 // The largest number of points of a scan. A page has less memory than a program: `amvnet predict` reads ten million points.
 export const MAX_POINTS = 1_000_000;
+const MAX_MISSING = 0.5;  // the share of missing intensities above which a scan counts as one without intensities
 const MAX_RINGS = 256;  // largest number of lasers; a column with larger values does not hold ring indices
 
 // The possible names of each column; the first name that a file has is read.
@@ -79,8 +80,13 @@ export function isPlaced(xyz, start) {
   return Number.isFinite(x) && Number.isFinite(y) && Number.isFinite(z) && (x !== 0 || y !== 0 || z !== 0);
 }
 
-/** Return the finite intensities of the points with a place, ascending; intensities of lost returns mean nothing. */
+/**
+ * Return the finite intensities of the points with a place, ascending, or none if most are missing; and the number of
+ * points with a place. Intensities of lost returns mean nothing.
+ */
 export function measuredIntensities({ xyz, intensity }) {
-  if (!intensity) return new Float64Array(0);
-  return Float64Array.from(intensity.values).filter((value, i) => Number.isFinite(value) && isPlaced(xyz, 3 * i)).sort();
+  if (!intensity) return { measured: new Float64Array(0), placed: 0 };
+  const values = Float64Array.from(intensity.values).filter((_, i) => isPlaced(xyz, 3 * i)), placed = values.length;
+  const measured = values.filter(Number.isFinite).sort(), areMissing = placed - measured.length > MAX_MISSING * placed;
+  return { measured: areMissing ? new Float64Array(0) : measured, placed };
 }

@@ -43,8 +43,10 @@ export function findFrame(xyz, name) {
   if (!ground) return frame;
 
   frame.tilt = degrees(Math.acos(Math.min(ground.up[2], 1)));
+  // An unsure plane that is tilted may be a bank beside the sensor, which shows no height.
+  if (!ground.isSure && frame.tilt > SAME_TILT) return frame;
   frame.height = ground.height;
-  if (ground.isSure && frame.tilt > SAME_TILT) {
+  if (frame.tilt > SAME_TILT) {
     // The ground is found a second time in the level scan, whose cells have other lowest points.
     const turn = rotation(...levelling(ground.up)), again = findGround(turned(level, turn));
     const up = again ? [0, 1, 2].map((axis) => dot([0, 1, 2].map((row) => turn[row][axis]), again.up)) : ground.up;
@@ -88,6 +90,17 @@ export function risesOf(frame, usualHeight) {
 
 function dot(a, b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+/** Return points (4 n) turned back from level to the tilt that the frame (pitch, roll) was found to have. */
+export function tilted(points, { pitch, roll }) {
+  if (!pitch && !roll) return points;
+  const turn = rotation(pitch, roll), result = points.slice();
+  for (let i = 0; i < points.length; i += 4) {
+    const point = points.subarray(i, i + 3);
+    for (let axis = 0; axis < 3; axis++) result[i + axis] = dot(point, turn.map((row) => row[axis]));
+  }
+  return result;
 }
 
 /** Return points (3 n) rotated by a (3, 3) matrix, float64. */

@@ -1,6 +1,6 @@
 // Find the ground in a scan: the plane that holds most of the lowest points around the sensor.
 
-import { drawing } from "./statistics.js";
+import { drawing, quantilesOf } from "./statistics.js";
 
 export const NEAREST = 1.0;  // the least distance of points that are used, metres; the vehicle is nearer
 const CELL = 1.0;  // the side of the cells whose lowest points are used, metres
@@ -12,6 +12,10 @@ const TOLERANCE = 0.1;  // the largest distance from the plane to a point of the
 const STEEPEST = 25.0;  // the largest slope of the ground, degrees; walls and embankments are steeper
 const LEAST_CELLS = 30;  // the least number of cells with points
 const LEAST_AGREEMENT = 0.25;  // the least weighted share of the cells that lie in the plane
+
+// The ground under the sensor may lie off the plane, where a road is curved.
+const NEAR_CELLS = 60;  // the number of cells that show the ground under the sensor
+const MAX_NEAR_OFF = 0.5;  // the largest distance from the plane to their lowest points, metres
 
 // These limits tell which side of the plane is up: things stand on the ground, and there is little below it.
 const OFF_PLANE = 0.3;  // the largest distance from the plane to its points, at the sensor, metres
@@ -56,8 +60,16 @@ export function findGround(xyz) {
   const isCommon = height < HIGHEST && below <= Math.max(above, MAX_BELOW);
   const isBelow = height > LOWEST ? isCommon : isSure && below < above / 2;
   if (agreement <= LEAST_AGREEMENT || !isBelow) return null;
-  const length = Math.hypot(a, b, 1);
-  return { up: [-a / length, -b / length, 1 / length], height, isSure };
+  const length = Math.hypot(a, b, 1), off = offPlaneAtSensor(low, plane);
+  const up = [-a / length, -b / length, 1 / length];
+  return { up, height: Math.abs(off) > TOLERANCE ? height - off : height, isSure };
+}
+
+/** Return how far above a plane the low points nearest to the sensor lie, metres. */
+function offPlaneAtSensor(low, plane) {
+  const mayBeGround = low.filter((point) => Math.abs(offPlane(point, plane)) < MAX_NEAR_OFF);
+  const near = mayBeGround.sort((a, b) => a.distance - b.distance).slice(0, NEAR_CELLS);
+  return quantilesOf(near.map((point) => offPlane(point, plane)).sort((a, b) => a - b), [0.5])[0];
 }
 
 function offPlane({ x, y, z }, [a, b, c]) {

@@ -35,7 +35,7 @@ function matching(quantiles, trained) {
  * `trained` says what the weights know: {quantiles, is_optional, is_matched}, or null.
  */
 export function intensityMap(cloud, trained) {
-  const { intensity, count } = cloud, measured = measuredIntensities(cloud);
+  const { intensity, count } = cloud, { measured } = measuredIntensities(cloud);
   const quantiles = quantilesOf(measured, PROBABILITIES), fill = () => filler(count, trained);
   if (!measured.length) return { text: `no intensity (${fillerText(trained)})`, apply: fill };
   if (isConstant(quantiles)) {
@@ -59,9 +59,22 @@ export function intensityMap(cloud, trained) {
   };
 }
 
+/** Describe how many points have no intensity although others have; empty if none. */
+export function missingText(cloud) {
+  const { measured, placed } = measuredIntensities(cloud), missing = placed - measured.length;
+  return measured.length && missing ? `no intensity in ${counted(missing)} of ${counted(placed)} points (the median instead)` : "";
+}
+
+/** Replace the missing intensities of points (4 n) by the median of the others, in place. */
+export function fillIntensity(points) {
+  const known = points.filter((value, place) => place % 4 === 3 && Number.isFinite(value)).sort();
+  const [median] = quantilesOf(known, [0.5]);
+  for (let i = 3; i < points.length; i += 4) if (!Number.isFinite(points[i])) points[i] = median;
+}
+
 /** Describe how many points have an intensity below 0, which counts as 0; empty if none or all have it. */
 export function negativeText(cloud) {
-  const measured = measuredIntensities(cloud), below = measured.findIndex((value) => value >= 0);
+  const { measured } = measuredIntensities(cloud), below = measured.findIndex((value) => value >= 0);
   if (below <= 0) return "";
   const lowest = Number(measured[0].toPrecision(6));
   return `intensity ${lowest} in ${counted(below)} of ${counted(measured.length)} points (0 instead)`;

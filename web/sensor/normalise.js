@@ -2,10 +2,10 @@
 
 import { InputError } from "../errors.js";
 import { isPlaced } from "../reading/cloud.js";
-import { findFrame, isOnGround, risesOf, toLevel } from "./frame.js";
+import { findFrame, isOnGround, risesOf, tilted, toLevel } from "./frame.js";
 import { NEAREST } from "./ground.js";
-import { intensityMap, matchIntensity, negativeText } from "./intensity.js";
-import { elevationOf, hasEndsOf, rowsOf } from "./rows.js";
+import { fillIntensity, intensityMap, matchIntensity, missingText, negativeText } from "./intensity.js";
+import { elevationOf, hasEndsOf, orderRings, rowsOf } from "./rows.js";
 import { quantilesOf } from "./statistics.js";
 
 const FARTHEST = 10_000;  // the limit of coordinates, metres; no LiDAR sees so far
@@ -26,28 +26,31 @@ export function normalise(cloud, expected) {
   const [toSensor, toTrained] = risesOf(frame, sensor.height);
 
   const level = toLevel(xyz, frame), map = intensityMap(cloud, expected.intensity), intensity = map.apply();
-  const lasers = lasersOf(validPoints(level, null, name), toSensor, cloud.ring);
-  const { points, places } = validPoints(level, intensity, name);
-  const rows = rowsOf(raised(points, toSensor), places, cloud, lasers, expected);
+  const { points, places } = validPoints(level, intensity, name), seen = raised(points, toSensor);
+  const { ring, fault } = orderRings(seen, cloud.ring && Uint8Array.from(places, (place) => cloud.ring[place]));
+  const lasers = lasersOf(seen, ring);
+  const rows = rowsOf(seen, tilted(seen, frame), ring, lasers, expected);
 
+  fillIntensity(points);
   const moved = raised(points, toTrained);
   matchIntensity(moved, expected.intensity);
-  const texts = [map.text, negativeText(cloud), ...frameTexts(frame), heightText(frame, sensor.height), lasersText(lasers)];
+  const texts = [map.text, missingText(cloud), negativeText(cloud), ...frameTexts(frame)];
+  texts.push(heightText(frame, sensor.height), fault, lasersText(lasers));
   const unknown = sensorText(lasers, sensor), text = `assumed ${texts.filter(Boolean).join(", ")}${unknown}`;
   return { count, points: moved, rows, places, text, isKnown: !unknown };
 }
 
-/** Return the points (4 n, float32) that are finite and not at the origin, and their places in the cloud. */
+/** Return the points (4 n, float32) at finite coordinates that are not the origin, and their places in the cloud. */
 function validPoints(xyz, intensity, name) {
   const count = xyz.length / 3, points = new Float32Array(4 * count), places = new Uint32Array(count);
   let filled = 0, isFar = false;
   for (let i = 0; i < count; i++) {
-    const [x, y, z] = [0, 1, 2].map((axis) => Math.fround(xyz[3 * i + axis])), bright = intensity ? intensity[i] : 0;
+    const [x, y, z] = [0, 1, 2].map((axis) => Math.fround(xyz[3 * i + axis]));
     if (!(x || y || z)) continue;
     const isNear = Math.abs(x) < FARTHEST && Math.abs(y) < FARTHEST && Math.abs(z) < FARTHEST;
     isFar ||= !isNear && Number.isFinite(x + y + z);
-    if (!isNear || !Number.isFinite(bright)) continue;
-    points.set([x, y, z, bright], 4 * filled);
+    if (!isNear) continue;
+    points.set([x, y, z, intensity[i]], 4 * filled);
     places[filled++] = i;
   }
   if (!filled) throw new InputError(`${name}: ${whyUnusable(count, isFar)}`);
@@ -62,9 +65,7 @@ function whyUnusable(count, isFar) {
       "label it with amvnet predict, and subtract the sensor's position x,y,z with --offset -x,-y,-z"
     );
   }
-  return (
-    "expected finite coordinates and intensities, found NaN, infinity or 0, 0, 0 in every point; leave the file out"
-  );
+  return "expected finite coordinates, found NaN, infinity or 0, 0, 0 in every point; leave the file out";
 }
 
 /** Return points (4 n) moved up by some metres, in float32. */
@@ -75,15 +76,15 @@ function raised(points, rise) {
 }
 
 /** Measure the lasers of a sensor: {beams, fov_up, fov_down}; null stands for what is unknown. */
-function lasersOf({ points, places }, rise, ring) {
-  const seen = raised(points, rise), elevations = [];
+function lasersOf(seen, ring) {
+  const elevations = [];
   for (let i = 0; i < seen.length; i += 4) {
     const [x, y, z] = seen.subarray(i, i + 3);
     if (Math.hypot(x, y) > NEAREST) elevations.push(elevationOf(x, y, z));
   }
   if (elevations.length < LEAST_POINTS) return { beams: null, fov_up: null, fov_down: null };
   const [bottom, top] = quantilesOf(Float64Array.from(elevations).sort(), [0.005, 0.995]);
-  const beams = ring ? new Set(Array.from(places, (place) => ring[place])).size : null;
+  const beams = ring ? new Set(ring).size : null;
   return { beams, fov_up: top, fov_down: bottom };
 }
 

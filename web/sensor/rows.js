@@ -1,9 +1,14 @@
 // Choose the rows of the points in the range image: by laser if the lasers are known, else by elevation.
 
+import { NEAREST } from "./ground.js";
+
 const OUTSIDE = 0.16;  // the largest share of points outside a field of view that is wide enough
 const SAME_ANGLE = 6;  // the largest difference of the ends of two fields of view that are alike, degrees
 const LASERS_SEEN = 0.75;  // the least share of a sensor's lasers that have returns in every scan
 const SLOPE_SPREAD = 0.035;  // the largest mean deviation of the slopes of one laser; about 2 degrees
+const MAX_RING_SPREAD = 0.2;  // the largest variance of the elevations within the rings, of all their variance
+const LEAST_RING_POINTS = 10;  // the least number of points of a ring whose elevation counts
+const SAME_ELEVATION = 0.1;  // rings that descend by less than this are in order, degrees
 const LEAST_POINTS = 64;  // the least mean number of points of a laser; fewer do not show an order
 
 /** Return the elevation of a point, degrees above the horizon. */
@@ -20,19 +25,20 @@ export function rowAt(elevation, { fov_up: top, fov_down: bottom, height }) {
  * Return the row (n) of each point in the range image; row 0 is the highest. Return null if the weights need rings, and
  * neither the scan nor its elevations give them.
  *
- * `points` (4 n) are the valid points in the sensor's frame, `places` (n) are their places in the cloud, and `lasers`
- * holds what was measured of the sensor.
+ * `points` (4 n) are the valid points in the sensor's frame, `tilted` (4 n) the same with the sensor's tilt, `ring` (n)
+ * are their lasers or null, and `lasers` holds what was measured of the sensor.
  */
-export function rowsOf(points, places, cloud, lasers, { view, sensor, as_is: isAsIs }) {
-  const byLaser = (ring) => ring && Int32Array.from(places, (place) => view.height - 1 - ring[place]);
+export function rowsOf(points, tilted, ring, lasers, { view, sensor, as_is: isAsIs }) {
+  const byLaser = (each) => each && Int32Array.from(each, (laser) => view.height - 1 - laser);
   if (view.rows === "laser" && hasEndsOf(lasers, sensor)) {
-    const ring = cloud.ring ?? lasersByOrder(cloud.xyz, view.height), highest = ring ? Math.max(...new Set(ring)) : -1;
-    if (highest >= LASERS_SEEN * view.height && highest < view.height) return byLaser(ring);
+    const each = ring ?? lasersByOrder(tilted, view.height) ?? lasersByOrder(points, view.height);
+    const highest = each ? Math.max(...new Set(each)) : -1;
+    if (highest >= LASERS_SEEN * view.height && highest < view.height) return byLaser(each);
   }
 
-  const elevations = Float64Array.from(places, (_, i) => elevationOf(...points.subarray(4 * i, 4 * i + 3)));
+  const elevations = Float64Array.from({ length: points.length / 4 }, (_, i) => elevationOf(...points.subarray(4 * i, 4 * i + 3)));
   const byElevation = viewByElevation(elevations, lasers, { view, sensor, isAsIs });
-  const rings = view.rows === "ring" ? byLaser(cloud.ring) : null;
+  const rings = view.rows === "ring" ? byLaser(ring) : null;
   // Lasers that no data sheet describes need not be evenly spaced.
   if (!byElevation || (rings && !sensor.name)) return rings;
 
@@ -42,21 +48,76 @@ export function rowsOf(points, places, cloud, lasers, { view, sensor, as_is: isA
 }
 
 /**
- * Return the laser (n) of each point (3 n), 0 the lowest; null if the order of the points does not show it.
+ * Return {ring, fault}: rings (n) of points (4 n) that ascend with the elevations, and what was wrong in words.
+ *
+ * A ring column is a claim that the elevations must confirm: a laser has one elevation, and the lasers ascend. Rings in
+ * another order are put in order. `ring` is null if there are none, or none that follow the elevations.
+ */
+export function orderRings(points, ring) {
+  if (!ring) return { ring, fault: "" };
+  const used = [];
+  ring.forEach((index, i) => {
+    const [x, y, z] = points.subarray(4 * i, 4 * i + 3), radius = Math.hypot(x, y);
+    if (radius > NEAREST) used.push({ index, waves: [x / radius, y / radius], elevation: elevationOf(x, y, z) });
+  });
+  const counts = new Map();
+  for (const { index } of used) counts.set(index, (counts.get(index) ?? 0) + 1);
+  if (counts.size < 2 || used.length < LEAST_RING_POINTS * counts.size) return { ring, fault: "" };
+
+  const meansOf = (valueOf) => {
+    const sums = new Map();
+    for (const point of used) sums.set(point.index, (sums.get(point.index) ?? 0) + valueOf(point) / counts.get(point.index));
+    return sums;
+  };
+  // A tilt of the sensor adds one wave around the sensor to the elevations of all lasers.
+  const values = [({ waves }) => waves[0], ({ waves }) => waves[1], ({ elevation }) => elevation];
+  const within = values.map((valueOf) => [valueOf, meansOf(valueOf)]);
+  const product = (a, b) => used.reduce((sum, point) => {
+    const [p, q] = [within[a], within[b]].map(([valueOf, means]) => valueOf(point) - means.get(point.index));
+    return sum + p * q;
+  }, 0);
+  const [xx, xy, yy, xe, ye] = [product(0, 0), product(0, 1), product(1, 1), product(0, 2), product(1, 2)];
+  const area = xx * yy - xy * xy, tilt = area ? [(xe * yy - ye * xy) / area, (ye * xx - xe * xy) / area] : [0, 0];
+  for (const point of used) point.elevation -= tilt[0] * point.waves[0] + tilt[1] * point.waves[1];
+
+  const means = meansOf(({ elevation }) => elevation), squares = (offOf) => used.reduce((sum, point) => sum + offOf(point) ** 2, 0);
+  const mean = used.reduce((sum, { elevation }) => sum + elevation, 0) / used.length;
+  const spread = squares(({ index, elevation }) => elevation - means.get(index));
+  if (spread > MAX_RING_SPREAD * squares(({ elevation }) => elevation - mean)) {
+    return { ring: null, fault: "rings that do not follow the elevations (not used)" };
+  }
+
+  const occurring = [...counts.keys()].sort((a, b) => a - b);
+  const ascending = occurring.filter((index) => counts.get(index) >= LEAST_RING_POINTS).map((index) => means.get(index));
+  if (!falls(ascending)) return { ring, fault: "" };
+  const isReversed = !falls(ascending.map((value) => -value)), byElevation = [...occurring].sort((a, b) => means.get(a) - means.get(b));
+  const lasers = new Map(occurring.map((index, place) => isReversed ? [index, occurring.at(-1) - index] : [byElevation[place], index]));
+  const known = isReversed ? "rings that count from the highest laser" : "rings in another order than the elevations";
+  return { ring: Int32Array.from(ring, (index) => lasers.get(index) ?? -1), fault: `${known} (put in order)` };
+}
+
+/** Return whether an elevation lies clearly below an earlier one. */
+function falls(elevations) {
+  let highest = -Infinity;
+  return elevations.some((value) => (highest = Math.max(highest, value)) - value > SAME_ELEVATION);
+}
+
+/**
+ * Return the laser (n) of each point (4 n), 0 the lowest; null if the order of the points does not show it.
  *
  * KITTI's files hold one laser after the other, from the highest to the lowest. Each laser begins at the front (+x) and
  * turns to the left. So the next laser begins where the azimuth passes the front from right to left. The order counts
  * only if it gives exactly as many lasers as the sensor has, and each laser keeps to one elevation, below the laser
  * before it.
  */
-export function lasersByOrder(xyz, lasers) {
-  const count = xyz.length / 3, order = new Int32Array(count), found = [[]];
+function lasersByOrder(points, lasers) {
+  const count = points.length / 4, order = new Int32Array(count), found = [[]];
   if (count < LEAST_POINTS * lasers) return null;
 
   let wasRight = false;
   for (let i = 0; i < count; i++) {
-    const [x, y, z] = xyz.subarray(3 * i, 3 * i + 3), slope = z / Math.hypot(x, y);
-    if (Number.isFinite(slope)) {  // a lost return at the origin has no slope; it gets the laser of the point before it
+    const [x, y, z] = points.subarray(4 * i, 4 * i + 3), slope = z / Math.hypot(x, y);
+    if (Number.isFinite(slope)) {  // a point on the axis has no slope; it gets the laser of the point before it
       if (wasRight && x > 0 && y >= 0) found.push([]);
       found.at(-1).push(slope);
       wasRight = x > 0 && y < 0;

@@ -145,7 +145,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
             "run it in one process"
         )
 
-    _suppress_library_warnings()
+    _set_warnings()
     if command in WITH_RECIPE:
         values = _parse_with_recipe(command, arguments)
     else:
@@ -180,8 +180,9 @@ def _has_several_processes() -> bool:
     return started() > 1
 
 
-def _suppress_library_warnings() -> None:
-    """Suppress warnings of libraries, which are meant for developers."""
+def _set_warnings() -> None:
+    """Print warnings in one line; suppress those of libraries, which are meant for developers."""
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     warnings.filterwarnings("ignore", module="lightning")
     warnings.filterwarnings("ignore", module="torch")
     # Python's process that tracks semaphores warns if a command was stopped at once.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,13 +11,14 @@ from typing import Any
 from amvnet.config.bounds import check_text
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import RangeViewConfig
-from amvnet.data.laser_order import lasers_by_order
+from amvnet.data.laser_order import lasers_by_order, order_rings
 from amvnet.errors import InputError, shown
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import (
     SIMULATED_QUANTILES,
     TrainedIntensity,
     check_intensity,
+    fill_intensity,
     match_scan,
 )
 from amvnet.sensors.lasers import MEASURES, SensorGeometry
@@ -59,6 +61,8 @@ class Expectation:
     def prepare(self, scan: Scan) -> Scan:
         """Return a scan of N points as the networks take it, with the points in the same order.
 
+        Missing intensities are filled in. Rings that do not ascend with the elevations are put in
+        order or left out. A warning says so.
         If the rows of the range image are lasers, the lasers of a scan without rings are recovered
         from the order of its points. A few intensities outside [0, 1] are clipped. If the training
         matched the intensities of each scan to a distribution, so does this.
@@ -66,6 +70,13 @@ class Expectation:
         Raises:
             InputError: if more than a few intensities are out of range.
         """
+        scan, missing = fill_intensity(scan, self.intensity)
+        if missing:
+            warnings.warn(f"the scan has {missing}", stacklevel=2)
+        if self.view.rows != "elevation" and scan.row is None:  # else the rows are known
+            scan, fault = order_rings(scan)
+            if fault:
+                warnings.warn(f"the scan has {fault}", stacklevel=2)
         if self.view.rows == "laser" and scan.ring is None:
             ring = lasers_by_order(scan.points, self.view.height)
             scan = dataclasses.replace(scan, ring=ring)

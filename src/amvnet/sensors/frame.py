@@ -124,9 +124,11 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
         frame = dataclasses.replace(frame, axes=axes)
         ground = find_ground(level)
 
-    if ground is None:
+    # An unsure plane that is tilted may be a bank beside the sensor, which shows no height.
+    is_tilted = ground is not None and ground.tilt > SAME_TILT
+    if ground is None or (is_tilted and not ground.is_sure):
         return frame
-    if sensor.rotate is None and ground.is_sure and ground.tilt > SAME_TILT:
+    if sensor.rotate is None and is_tilted:
         return _level(frame, level, ground)
     return dataclasses.replace(frame, height=ground.height, tilt=ground.tilt)
 

@@ -18,6 +18,10 @@ MAX_SLOPE = 25.0  # largest slope of the ground, degrees: steeper planes are wal
 MIN_CELLS = 30  # smallest number of cells with points
 MIN_AGREEMENT = 0.25  # smallest weighted share of the cells that lie in the plane
 
+# The ground under the sensor may lie off the plane, where a road is curved.
+NEAR_CELLS = 60  # number of cells that show the ground under the sensor
+MAX_NEAR_OFF = 0.5  # largest distance of their lowest points from the plane, metres
+
 # Which side of the plane is up? The ground has things above it, and little below it.
 MAX_OFF_PLANE = 0.3  # largest distance from the plane of points that belong to it, metres
 OFF_PLANE_PER_METRE = 0.02  # increase of this distance for each metre from the sensor, metres
@@ -39,7 +43,7 @@ class Ground:
 
     Attributes:
         up: (3,) the normal of the plane, of length 1.
-        height: height of the origin over the plane along z, metres.
+        height: height of the origin over the ground along z, metres.
         is_sure: whether the plane is sure enough to turn the scan by it.
     """
 
@@ -103,7 +107,18 @@ def find_ground(xyz: NDArray[np.floating]) -> Ground | None:
         return None
 
     normal = np.array([-plane[0], -plane[1], 1])
+    off = _off_plane_at_sensor(low, plane)
+    if abs(off) > TOLERANCE:
+        height -= off
     return Ground(normal / np.linalg.norm(normal), height, is_sure)
+
+
+def _off_plane_at_sensor(low: NDArray[np.floating], plane: NDArray[np.floating]) -> float:
+    """Return how far above a plane the low points (M, 3) nearest to the sensor lie, metres."""
+    off_plane = low[:, 2] - _with_ones(low) @ plane
+    may_be_ground = np.abs(off_plane) < MAX_NEAR_OFF
+    order = np.argsort(np.hypot(low[:, 0], low[:, 1])[may_be_ground], kind="stable")
+    return float(np.median(off_plane[may_be_ground][order[:NEAR_CELLS]]))
 
 
 def _sides(xyz: NDArray[np.floating], plane: NDArray[np.floating]) -> tuple[float, float]:

@@ -7,12 +7,13 @@ them. All decisions rest on quantiles, so that a few outliers change nothing.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from amvnet.data.formats.cloud import WILD_SHARE, as_fractions
+from amvnet.data.formats.cloud import MAX_MISSING_SHARE, WILD_SHARE, as_fractions
 from amvnet.errors import InputError, shown
 from amvnet.scan import Scan
 
@@ -260,6 +261,40 @@ def describe_filler(trained: TrainedIntensity | None) -> str:
     if trained.is_optional:
         return "0 instead, as in a part of the training"
     return "drawn at random as in the training; the labels will be much worse"
+
+
+def fill_intensity(scan: Scan, trained: TrainedIntensity | None) -> tuple[Scan, str]:
+    """Return a scan whose points all have an intensity, and which ones were missing.
+
+    A few missing intensities become the median of the others. If more than `MAX_MISSING_SHARE` are
+    missing, the scan becomes one without intensities: real ones among many zeros would mislead.
+
+    Args:
+        scan: a scan; intensities that are not finite are missing.
+        trained: the intensities of the training, or None if these are unknown.
+
+    Returns:
+        The scan, and in words what was missing and what replaces it; empty if nothing was missing.
+    """
+    is_finite = np.isfinite(scan.points[:, 3])
+    if is_finite.all():
+        return scan, ""
+    valid = scan.valid
+    is_missing = valid & ~is_finite
+    missing = np.count_nonzero(is_missing)
+    if not missing:
+        return scan, ""
+
+    points = scan.points.copy()
+    if missing > MAX_MISSING_SHARE * np.count_nonzero(valid):
+        points[:, 3] = 0 if trained is None else trained.filler(len(scan))
+        instead = describe_filler(trained)
+    else:
+        points[is_missing, 3] = np.median(points[valid & is_finite, 3])
+        instead = "the median instead"
+    share = math.ceil(100 * missing / np.count_nonzero(valid))
+    text = f"no intensity in {share} % of the points ({instead})"
+    return dataclasses.replace(scan, points=points), text
 
 
 def check_intensity(scan: Scan) -> Scan:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.laser_order import order_rings
 from amvnet.errors import InputError, errors_of
 from amvnet.scan import Scan
 from amvnet.sensors.frame import STEADY_TILT, Frame, find_frame, median_frame
@@ -122,12 +123,9 @@ class Recording:
 
     def _measure_in(self, frame: Frame, cloud: Cloud) -> Estimate:
         """Measure the lasers and the intensities of a scan whose frame is known."""
-        # Points without an intensity also show the lasers.
-        scan = level_scan(cloud, frame.complete(self._sensor))
-        to_sensor, _ = frame.rises(self._sensor, self._usual_height)
-        seen = raise_points(scan, to_sensor)
-        valid = scan.valid
-        lasers = measure_lasers(seen.points[valid], None if scan.ring is None else scan.ring[valid])
+        seen, _ = seen_scan(cloud, frame, self._sensor, self._usual_height)
+        valid = seen.valid
+        lasers = measure_lasers(seen.points[valid], None if seen.ring is None else seen.ring[valid])
         return Estimate(frame, lasers, quantiles_of(cloud.measured_intensity()))
 
     def _recognises(self, cloud: Cloud, usual: Estimate) -> bool:
@@ -177,6 +175,27 @@ def _are_steady(frames: Sequence[Frame]) -> bool:
         return False
     turns = np.array([(frame.pitch, frame.roll) for frame in frames])
     return bool((np.ptp(turns, axis=0) < STEADY_TILT).all())
+
+
+def seen_scan(
+    cloud: Cloud,
+    frame: Frame,
+    sensor: Sensor,
+    usual_height: float | None,
+    intensity: np.ndarray | None = None,
+) -> tuple[Scan, str]:
+    """Return a level scan with the sensor at the origin, and what was wrong with its rings.
+
+    Args:
+        cloud: the points of a file.
+        frame: the frame of the file.
+        sensor: what is known about the sensor.
+        usual_height: as `Frame.rises` takes it.
+        intensity: (N,) intensities in [0, 1]; by default zeros.
+    """
+    scan = level_scan(cloud, frame.complete(sensor), intensity)
+    to_sensor, _ = frame.rises(sensor, usual_height)
+    return order_rings(raise_points(scan, to_sensor))
 
 
 def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:

@@ -17,16 +17,16 @@ from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.frame import Frame
-from amvnet.sensors.intensity import IntensityMap, intensity_map
+from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
 from amvnet.sensors.lasers import SensorGeometry, elevations
-from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.lidars import Sensor, rotation_from_degrees
 from amvnet.sensors.measure import (
     MEASURED_SCANS,
     Estimate,
     Recording,
-    level_scan,
     median_of,
     raise_points,
+    seen_scan,
 )
 
 # Largest height of a sensor on a vehicle, metres. A larger height may be in feet.
@@ -52,16 +52,16 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     """
     to_intensity = _intensity_map(cloud, estimate.quantiles, sensor, expected)
     intensity = to_intensity(cloud.intensity, len(cloud.xyz))
-    scan = level_scan(cloud, estimate.frame.complete(sensor), intensity)
+    height = expected.sensor.height
+    seen, _ = seen_scan(cloud, estimate.frame, sensor, height, intensity)
+    seen, _ = fill_intensity(seen, expected.intensity)
+    to_sensor, to_trained = estimate.frame.rises(sensor, height)
+    moved = raise_points(seen, to_trained - to_sensor)
 
-    to_sensor, to_trained = estimate.frame.rises(sensor, expected.sensor.height)
-    seen = raise_points(scan, to_sensor)
-    moved = raise_points(scan, to_trained)
-
-    valid = scan.valid
+    valid = seen.valid
     lasers = estimate.lasers.override(sensor)
     view = _row_view(seen.points[valid], lasers, expected)
-    row = _rows_by_laser(cloud, lasers, expected)
+    row = _rows_by_laser(seen, estimate.frame.complete(sensor), lasers, expected)
     if row is None:
         row = _rows(seen, valid, view, expected)
     return dataclasses.replace(moved, row=row)
@@ -70,12 +70,15 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
 def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
     """Return one line: what is assumed about a scan, and whether the weights know its sensor."""
     lasers = estimate.lasers.override(sensor)
+    _, ring_fault = seen_scan(cloud, estimate.frame, sensor, expected.sensor.height)
     assumed = [
         cloud.note,
         _intensity_map(cloud, estimate.quantiles, sensor, expected).text,
+        _describe_missing(cloud),
         _describe_negative(cloud),
         *_describe_frame(estimate.frame, sensor),
         _describe_height(estimate.frame, sensor, expected.sensor.height),
+        ring_fault,
         describe_lasers(lasers),
     ]
     line = f"{cloud.name}: assumed {', '.join(filter(None, assumed))}"
@@ -288,28 +291,28 @@ def _rows(
 ) -> np.ndarray | None:
     """Return the row of each point by elevation: (N,), 0 is the top, -1 is a lost point.
 
-    Return None if the weights' rows are rings and the scan's rings suit them, or if no view gives
-    rows.
+    If the weights' rows are rings and the scan's rings suit them, the rings decide. Return None if
+    neither the rings nor a view give rows.
     """
-    ring = scan.ring if expected.view.rows == "ring" else None
+    by_ring = None
+    if expected.view.rows == "ring" and scan.ring is not None:
+        by_ring = _rows_of_rings(scan.ring, expected.view)
     # If no data sheet describes the lasers, they may be unevenly spaced.
-    is_trusted = ring is not None and not expected.sensor.name
+    is_trusted = by_ring is not None and not expected.sensor.name
     if view is None or is_trusted:
-        return None
+        return by_ring
 
     rows = np.full(len(scan), -1)
     rows[valid] = RangeView(view).rows(PointBatch.of([scan])).numpy()
-    if ring is not None:
-        by_ring = view.height - 1 - ring
-        if np.median(np.abs(by_ring - rows)[valid]) < 1:  # the rings agree with the elevations
-            return None
+    if by_ring is not None and np.median(np.abs(by_ring - rows)[valid]) < 1:
+        return by_ring
     return rows
 
 
 def _rows_by_laser(
-    cloud: Cloud, lasers: SensorGeometry, expected: Expectation
+    seen: Scan, sensor: Sensor, lasers: SensorGeometry, expected: Expectation
 ) -> np.ndarray | None:
-    """Return the row of each point by its laser: (N,), 0 is the top.
+    """Return the row of each point by its laser: (N,), 0 is the top, -1 is unknown.
 
     Return None if the weights' rows are not lasers, or if the scan's lasers are unknown or unlike
     the training's lasers.
@@ -318,12 +321,21 @@ def _rows_by_laser(
     if view.rows != "laser" or not lasers.has_ends_of(expected.lasers):
         return None
 
-    ring = cloud.ring
+    ring = seen.ring
     if ring is None:
-        ring = lasers_by_order(cloud.xyz, view.height)
+        # The sensor may be tilted as it fires, or the file may have been turned after it.
+        turn = rotation_from_degrees(*(sensor.rotate or (0, 0, 0))).astype(np.float32)
+        ring = lasers_by_order(seen.points[:, :3] @ turn, view.height)
+        if ring is None and not np.array_equal(turn, np.eye(3)):
+            ring = lasers_by_order(seen.points, view.height)
     if ring is None or not view.has_laser_per_row(ring.max()):
         return None
-    return view.height - 1 - ring
+    return _rows_of_rings(ring, view)
+
+
+def _rows_of_rings(ring: np.ndarray, view: RangeViewConfig) -> np.ndarray:
+    """Return the rows of lasers (N,), of which the lowest has the last row; -1 is unknown."""
+    return np.where(ring < 0, -1, view.height - 1 - ring)
 
 
 def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
@@ -339,6 +351,15 @@ def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
             f"0,{frame.pitch:.1f},{frame.roll:.1f})"
         )
     return texts
+
+
+def _describe_missing(cloud: Cloud) -> str:
+    """Return in words how many points have no intensity although others have; empty if none."""
+    measured = cloud.measured_intensity()
+    count = np.count_nonzero(cloud.is_placed)
+    if measured is None or len(measured) == count:
+        return ""
+    return f"no intensity in {count - len(measured):,} of {count:,} points (the median instead)"
 
 
 def _describe_negative(cloud: Cloud) -> str:

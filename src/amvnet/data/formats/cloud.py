@@ -20,6 +20,7 @@ MAX_RINGS = 256  # largest number of lasers; a column with larger values does no
 # The largest intensity that a sensor can write: as a fraction, in 8 bits or in 16 bits.
 FLOAT_RANGES = (1.0, 255.0, 65535.0)
 INTEGER_RANGES = (255.0, 65535.0)  # integers are not fractions
+MAX_MISSING_SHARE = 0.5  # a scan in which more intensities are missing counts as one without
 WILD_SHARE = 0.001  # the largest share of outliers, intensities above the range of all others
 
 Arrays = dict[str, np.ndarray]  # columns (N,) by key
@@ -71,15 +72,18 @@ class Cloud:
         return placed
 
     def measured_intensity(self) -> np.ndarray | None:
-        """Return the finite intensities (M,) of points that are placed; None if there are none.
+        """Return the finite intensities (M,) of points that are placed; None if most are missing.
 
         The intensity of a lost return says nothing about the other intensities.
         """
         if self.intensity is None:
             return None
 
-        measured: np.ndarray = self.intensity[self.is_placed & np.isfinite(self.intensity)]
-        return measured if len(measured) else None
+        placed = self.intensity[self.is_placed]
+        measured: np.ndarray = placed[np.isfinite(placed)]
+        if not len(measured) or len(placed) - len(measured) > MAX_MISSING_SHARE * len(placed):
+            return None
+        return measured
 
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.
@@ -162,8 +166,8 @@ def _why_unusable(xyz: np.ndarray) -> str:
             "as in map coordinates; subtract the sensor's position x,y,z with --offset -x,-y,-z"
         )
     return (
-        "expected finite coordinates and intensities, found NaN, infinity or 0, 0, 0 in every "
-        "point; leave the file out"
+        "expected finite coordinates, found NaN, infinity or 0, 0, 0 in every point; "
+        "leave the file out"
     )
 
 
