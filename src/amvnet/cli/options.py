@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from amvnet.cli.console import report, silence
+from amvnet.cli.parser import flag_of
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -303,6 +304,17 @@ class ScoresChoice:
             ScoreFolder("a", self.scores_a, self.logits in ("a", "both")),
             ScoreFolder("b", self.scores_b, self.logits in ("b", "both")),
         )
+
+
+def given(choice: Any) -> list[str]:
+    """Return the options of a choice whose values are not the defaults, as words of a command."""
+    words = []
+    for field in fields(choice):
+        value = getattr(choice, field.name)
+        if value != field.default:
+            text = ",".join(value) if isinstance(value, tuple) else str(value)
+            words.append(f"{flag_of(field.name)}={text}")
+    return words
 
 
 def load_segmenter(

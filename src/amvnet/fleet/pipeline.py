@@ -340,7 +340,7 @@ class FleetRun:
 
         if METHODS[self.request.method].has_two_networks:
             usual = self.request.weights.usual_uncertain_at(self.request.tau)
-            drives = [Entry("", "", drive, points[drive], uncertain[drive]) for drive in points]
+            drives = [Entry("", "", drive, points[drive], uncertain[drive], []) for drive in points]
             report_certainty(drives, usual, self._report)
         check_faults(faults, len(self._names))
         return written
