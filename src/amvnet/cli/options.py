@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 # Only nuScenes has the last two splits.
 Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
 
-FormatName = Literal["label", "npy", "ply"]  # the format of label files for scan files
+# The format of label files for scan files.
+FormatName = Literal["label", "npy", "ply", "pcd", "las", "laz"]
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 MAX_SEQUENCES = 20  # largest number of sequences that a line names
@@ -201,7 +202,8 @@ class LabelChoice:
     """a point goes to the head if the cosine similarity of the two networks' probabilities is at
     most this value, in [0, 1]; a lower value takes less time; default: the value in the weights."""
     format: FormatName = "label"
-    """the format of the labels of scan files: raw ids (label, npy), or coloured points (ply)."""
+    """the format of the labels of scan files: raw ids (label, npy), or coloured points (ply, pcd,
+    las, laz)."""
     classes: str | None = None
     """other classes, to which the classes of the weights are mapped: coarse, lidog, or a YAML
     file."""

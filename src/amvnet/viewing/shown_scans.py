@@ -24,7 +24,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import Scores
 from amvnet.models.assertion import cosine_similarity
 from amvnet.progress import Progress, no_progress
-from amvnet.scan import check_scan
+from amvnet.scan import Scan, check_scan
 
 # Colours for a dark background, RGB in 0..255. Points without a class get a grey, because their
 # official colour is black.
@@ -122,6 +122,11 @@ def show_scans(
     return stream_scans(scans, load, show, at_once, progress)
 
 
+def short_name(scan: Scan) -> str:
+    """Return the name of a scan for people, without folders."""
+    return Path(scan.name).name or "scan"
+
+
 def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
     """Return what the page shows of a segmented scan.
 
@@ -152,7 +157,7 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
 
     second_probability, second = _shares(scores[origin.method]).topk(2, dim=1)
     shown = ShownScan(
-        Path(scan.name).name or "scan",
+        short_name(scan),
         scan.points,
         scan.valid,
         truth=scan.labels,

@@ -348,6 +348,11 @@ def built_in() -> dict[str, Path]:
     return paths
 
 
+def list_weights() -> list[str]:
+    """Return the names of the built-in weights, which `amvnet.load` takes."""
+    return list(built_in())
+
+
 def _find(name_or_path: str) -> Path:
     """Return the path of a weights file; weights on the hub are downloaded if necessary."""
     if name_or_path.startswith(hub.PREFIX):
