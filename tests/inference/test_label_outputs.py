@@ -18,6 +18,7 @@ import amvnet
 from amvnet.cli.options import FormatName
 from amvnet.data.formats.find import read_cloud
 from amvnet.data.labels.writers import KINDS, write_scan_labels
+from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 
 from fixtures.commands import fails, files, run_cli
@@ -138,7 +139,7 @@ def test_other_libraries_read_the_files(kind: str, with_uncertain: bool, tmp_pat
         return
 
     check_coordinates(kind, content.xyz, xyz)
-    np.testing.assert_array_equal(content.colors, np.array(SEMANTICKITTI.colors)[ids])
+    np.testing.assert_array_equal(content.colors, np.array(class_colors(SEMANTICKITTI))[ids])
     if with_uncertain:
         np.testing.assert_array_equal(content.uncertain, uncertain)
     else:

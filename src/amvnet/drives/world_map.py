@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from amvnet.data.class_maps import class_map
 from amvnet.data.labels.clouds import COLORS, check_laspy, write_cloud
+from amvnet.data.palette import class_colors
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.drives.consensus import STEPS, VoxelTable, index_of, keys_of, sum_by, weighted_logs
@@ -69,7 +70,7 @@ class WorldMap:
             InputError: if the ending is another one, or laspy is missing.
         """
         check_ending(path)
-        colors = np.asarray(self.taxonomy.colors, np.uint8)[self.labels]
+        colors = np.asarray(class_colors(self.taxonomy), np.uint8)[self.labels]
         columns = dict(zip("xyz", self.xyz.T, strict=True))
         columns |= dict(zip(COLORS, colors.T, strict=True))
         columns["class"] = self.taxonomy.to_raw(self.labels).astype(np.int32)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from amvnet.data.labels.writers import KINDS, SIGNATURES, write_scan_labels
+from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, did_you_mean
 from amvnet.models.amvnet import Scores
@@ -188,7 +189,7 @@ class Segmentation:
     @property
     def colors(self) -> NDArray[np.uint8]:
         """(K + 1, 3) RGB colours of the classes in 0..255, by id: `colors[labels]` is (N, 3)."""
-        return np.asarray(self.require_origin().taxonomy.colors, dtype=np.uint8)
+        return np.asarray(class_colors(self.require_origin().taxonomy), dtype=np.uint8)
 
     @property
     def raw_ids(self) -> NDArray[np.uint32]:

@@ -32,7 +32,6 @@ from amvnet.outputs import Signature, check_outputs
 from amvnet.scan import AnyArray, Scan
 from amvnet.viewing.shown_scans import (
     RIGHT,
-    UNLABELLED,
     UNSCORED,
     ShownScan,
     short_name,
@@ -222,6 +221,7 @@ def pack(shown: ShownScan) -> Packed:
         "name": shown.name,
         "count": len(indices),
         "note": "; ".join(notes),
+        "corrected": shown.corrected,
         "center": center.tolist(),
         "step": step.tolist(),
         "planes": list(planes),
@@ -295,7 +295,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     return {
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
-        "colors": [UNLABELLED, *class_colors(taxonomy)[1:]],
+        "colors": class_colors(taxonomy),
         "raw": taxonomy.train_to_raw,
         "present": sorted(present),
         "sources": sources,

@@ -10,6 +10,7 @@ import numpy as np
 
 from amvnet.data.labels.clouds import COLORS, PCD_HEADER, check_laspy, write_cloud
 from amvnet.data.labels.ids import check_count, write_ids
+from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -97,7 +98,7 @@ def write_scan_labels(
             return path
 
         columns = _coordinates(xyz)
-        colors = np.asarray(taxonomy.colors, dtype=np.uint8)[ids]
+        colors = np.asarray(class_colors(taxonomy), dtype=np.uint8)[ids]
         columns |= dict(zip(COLORS, colors.T, strict=True))
         columns["class"] = raw.astype(np.int32)
         if uncertain is not None:
