@@ -344,13 +344,6 @@ def test_labels_in_the_folder_of_the_scans_stay(world: Path, tmp_path: Path) -> 
     succeed(command)
 
 
-def test_two_runs_share_a_folder_if_their_scans_differ(world: Path, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        scan = f"{world}/pair/{name}.bin"
-        succeed(f"predict {scan} --weights {world}/w.safetensors --out {tmp_path}")
-    assert files(tmp_path) == {"a.label", "b.label"}
-
-
 def test_what_a_killed_run_wrote_last_is_written_again(world: Path, tmp_path: Path) -> None:
     """The run was killed after it wrote a file, and before it noted that."""
     command = CASES["predict"].text(world, tmp_path)

@@ -19,6 +19,7 @@ import pytest
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter
 from amvnet.data.formats.find import read_cloud
+from amvnet.data.labels.writers import KINDS
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.weights.file import save
 
@@ -156,7 +157,7 @@ def test_names_colours_and_raw_ids_are_aligned_with_ids(result: Segmentation) ->
     assert result.raw_ids.dtype == np.uint32
 
 
-@pytest.mark.parametrize("kind", ["label", "npy", "ply"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_result_is_saved_in_the_format_of_the_ending(
     kind: str, result: Segmentation, tmp_path: Path
 ) -> None:
@@ -167,7 +168,23 @@ def test_a_result_is_saved_in_the_format_of_the_ending(
     elif kind == "npy":
         np.testing.assert_array_equal(np.load(path, allow_pickle=False), result.raw_ids)
     else:
-        np.testing.assert_allclose(read_cloud(path).xyz, POINTS[:, :3], atol=1e-4)
+        np.testing.assert_allclose(read_cloud(path).xyz, POINTS[:, :3], atol=6e-4)
+
+
+def test_counts_masks_and_points_are_of_the_labels(result: Segmentation) -> None:
+    np.testing.assert_array_equal(result.points, POINTS[:, :3])
+    counts = result.counts()
+    assert sum(counts.values()) == len(result)
+    assert list(counts.values()) == sorted(counts.values(), reverse=True)
+    for name, count in counts.items():
+        assert result.mask(name).sum() == count == (result.labels == names_of(result)[name]).sum()
+    np.testing.assert_array_equal(result.mask(*counts), np.ones(len(result), bool))
+    assert not result.mask().any()
+    fails(lambda: result.mask("cat"), "'cat'", "did you mean car")
+
+
+def names_of(result: Segmentation) -> dict[str, int]:
+    return {name: index for index, name in enumerate(result.class_names)}
 
 
 @pytest.mark.parametrize("name", ["a", "a.txt", "a.PLY", "a.bin", ".ply"])
@@ -184,7 +201,6 @@ def test_a_scan_is_never_replaced_by_its_labels(tmp_path: Path, segmenter: Segme
     os.link(tmp_path / "a.ply", tmp_path / "hard.ply")
     for name in ("a.ply", "link.ply", "hard.ply", "../" + tmp_path.name + "/a.ply"):
         fails(partial(result.save, tmp_path / name), "a.ply", "found the input")
-        fails(partial(amvnet.show, result, tmp_path / name, False), "found the input")
     assert (tmp_path / "a.ply").read_bytes() == before
     assert (tmp_path / "link.ply").is_symlink()
 
@@ -192,7 +208,7 @@ def test_a_scan_is_never_replaced_by_its_labels(tmp_path: Path, segmenter: Segme
 def test_labels_replace_earlier_labels_and_nothing_else(
     result: Segmentation, tmp_path: Path
 ) -> None:
-    for kind in ("label", "npy", "ply"):
+    for kind in KINDS:
         path = result.save(tmp_path / f"a.{kind}")
         before = path.read_bytes()
         assert result.save(path).read_bytes() == before
@@ -221,6 +237,21 @@ def test_show_writes_a_page_and_opens_it(
     for name, scores in (("rv", result.rv), ("bev", result.bev)):
         assert scores is not None
         np.testing.assert_array_equal(planes[name], scores[is_valid].argmax(axis=1) + 1)
+
+
+def test_show_takes_points_and_adds_the_ending_of_a_page(tmp_path: Path) -> None:
+    for points in (POINTS, Scan(POINTS), POINTS.tolist()):
+        path = amvnet.show(points, tmp_path / "v", open_browser=False)
+        assert path == tmp_path / "v.html"
+        xyz, planes = read_page(path).scan(0)
+        assert len(xyz) == len(POINTS)
+        assert set(planes) == {"intensity"}
+    fails(lambda: amvnet.show(POINTS * np.nan, tmp_path / "n"), "expected points")
+
+
+def test_the_listed_weights_can_be_loaded() -> None:
+    for name in amvnet.list_weights():
+        assert amvnet.weights.load(name).parts == ("range_net", "polar_net", "point_head")
 
 
 def test_show_needs_no_path_and_no_browser(segmenter: Segmenter) -> None:
@@ -280,6 +311,8 @@ def segment(path: Path) -> float:
     first, second = segmenter.many([scan, np.zeros((3, 4), np.float32)])
     saved: Path = segmenter(path).save("a.ply")
     page: Path = amvnet.show(first, saved)
+    amvnet.show(scan.points, open_browser=False)
+    print(amvnet.list_weights()[0], first.counts()["car"], first.points[first.mask("car")])
     names: list[str] = [second.class_names[index] for index in result.labels]
     rgb = result.colors[result.labels]
     print(page, names, rgb.shape, result.raw_ids.tolist(), amvnet.__version__)

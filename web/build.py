@@ -17,10 +17,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from amvnet.data.palette import DRAWN
+from amvnet.data.palette import DRAWN, UNLABELLED
 from amvnet.export.onnx import export
 from amvnet.viewing.page import drawing, fill_page
-from amvnet.viewing.shown_scans import UNLABELLED
 from lidarstreets import simulate
 
 ROOT = Path(__file__).parents[1]

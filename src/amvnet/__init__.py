@@ -1,9 +1,26 @@
-"""AMVNet: LiDAR semantic segmentation by two projections and late fusion.
+"""Label each point of a LiDAR scan: road, car, person, ...
 
-    segmenter = amvnet.load("sim-hdl64e")
-    result = segmenter(points)
+Load a segmenter, call it, and save or show the result:
 
-Names are imported when they are first used, so that `import amvnet` is fast.
+    import amvnet
+
+    segmenter = amvnet.load("sim-hdl64e")  # or another of amvnet.list_weights(), or a file
+    result = segmenter("scan.pcd")         # or an array (N, 4): x, y, z, intensity in [0, 1]
+    result.save("scan.ply")                # or .pcd, .las, .laz, .npy, .label
+    amvnet.show(result)                    # in 3D, in the browser
+
+A result has, in the order of the points:
+
+    result.labels, result.class_names      # ids (N,), and the name of each id
+    result.points, result.uncertain        # x, y, z (N, 3); where the two networks disagree (N,)
+    result.counts()                        # {"road": 65510, "car": 3298, ...}
+    result.mask("car", "truck")            # which points are one of these (N,)
+    result.verdict                         # whether the labels can be relied on
+
+Many scans: `segmenter.each("folder")`. Scans in memory: `amvnet.read`, `amvnet.read_all`. A drive:
+`amvnet.drive`. The scores of two other models: `amvnet.fuse`. Scans to try: `amvnet.simulate`.
+
+Bad input raises `amvnet.InputError` with one line: what was expected, what was found, what to do.
 """
 
 from __future__ import annotations
@@ -34,21 +51,24 @@ if TYPE_CHECKING:
     from amvnet.scan import Scan as Scan
     from amvnet.viewing.page import show as show
     from amvnet.weights.file import Weights as Weights
+    from amvnet.weights.file import list_weights as list_weights
     from amvnet.weights.push import push as push
 
+# The modules of the names, which are imported when they are first used: `import amvnet` is fast.
 _MODULES = {
-    "InputError": "amvnet.errors",
     "Scan": "amvnet.scan",
     "Segmentation": "amvnet.inference.segmentation",
     "Segmenter": "amvnet.inference.segmenter",
     "Weights": "amvnet.weights.file",
     "drive": "amvnet.inference.drive",
     "fuse": "amvnet.inference.fuse",
+    "list_weights": "amvnet.weights.file",
     "push": "amvnet.weights.push",
     "read": "amvnet.inference.listing",
     "read_all": "amvnet.inference.listing",
     "show": "amvnet.viewing.page",
     "simulate": "amvnet.data.datasets.simulated",
+    "InputError": "amvnet.errors",
 }
 __all__ = ["load", *_MODULES]
 __version__ = version("amvnet")

@@ -28,6 +28,7 @@ def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     pytest.importorskip("embreex")
     pushed: list[str] = []
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("webbrowser.open", lambda url: None)
     monkeypatch.setattr(amvnet, "push", lambda weights, name, **_: pushed.append(name), False)
 
     variables = execute(PAGE.blocks("python"))

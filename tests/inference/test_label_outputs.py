@@ -8,14 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
+import laspy
 import numpy as np
 import plyfile
+import pypcd4
 import pytest
 
 import amvnet
 from amvnet.cli.options import FormatName
 from amvnet.data.formats.find import read_cloud
 from amvnet.data.labels.writers import KINDS, write_scan_labels
+from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 
 from fixtures.commands import fails, files, run_cli
@@ -24,7 +27,7 @@ from fixtures.scan_writers import some_points, write_bag1, write_pcd
 
 COUNT = 60
 LOST = 7  # the index of a point with NaN
-WITH_POINTS = ("ply",)  # kinds of files with coordinates
+WITH_POINTS = ("ply", "pcd", "las", "laz")  # kinds of files with coordinates
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,23 @@ def read_ply(path: Path) -> LabelFile:
     return LabelFile(vertex["class"], xyz, colors, uncertain)
 
 
+def read_pcd(path: Path) -> LabelFile:
+    table = pypcd4.PointCloud.from_path(path).pc_data
+    xyz = np.stack([table["x"], table["y"], table["z"]], axis=1)
+    rgb = np.ascontiguousarray(table["rgb"]).view(np.uint8).reshape(-1, 4)
+    uncertain = table["uncertain"] if "uncertain" in (table.dtype.names or ()) else None
+    return LabelFile(table["class"], xyz, rgb[:, 2::-1], uncertain)
+
+
+def read_las(path: Path) -> LabelFile:
+    cloud = laspy.read(path)
+    names = list(cloud.point_format.dimension_names)
+    raw = np.asarray(cloud["class"] if "class" in names else cloud.classification)
+    colors = np.stack([cloud.red, cloud.green, cloud.blue], axis=1) // 257
+    uncertain = np.asarray(cloud["uncertain"]) if "uncertain" in names else None
+    return LabelFile(raw, cloud.xyz, colors, uncertain)
+
+
 def read_npy(path: Path) -> LabelFile:
     raw = np.load(path, allow_pickle=False)
     assert raw.dtype == np.uint32
@@ -62,6 +82,9 @@ READERS: dict[str, Callable[[Path], LabelFile]] = {
     "label": lambda path: LabelFile(np.fromfile(path, "<u4")),
     "npy": read_npy,
     "ply": read_ply,
+    "pcd": read_pcd,
+    "las": read_las,
+    "laz": read_las,
 }
 
 
@@ -81,9 +104,13 @@ def make_scan(
     return xyz, ids.astype(np.uint8), uncertain
 
 
-def check_coordinates(xyz: np.ndarray | None, expected: np.ndarray) -> None:
+def check_coordinates(kind: str, xyz: np.ndarray | None, expected: np.ndarray) -> None:
+    """Check the coordinates: LAS has millimetres, and lost points at the origin."""
     assert xyz is not None
-    np.testing.assert_array_equal(xyz, expected)
+    if kind.startswith("la"):
+        np.testing.assert_allclose(np.nan_to_num(xyz), np.nan_to_num(expected), atol=6e-4)
+    else:
+        np.testing.assert_array_equal(xyz, expected)
 
 
 # --- the files ---
@@ -111,8 +138,8 @@ def test_other_libraries_read_the_files(kind: str, with_uncertain: bool, tmp_pat
     if kind not in WITH_POINTS:
         return
 
-    check_coordinates(content.xyz, xyz)
-    np.testing.assert_array_equal(content.colors, np.array(SEMANTICKITTI.colors)[ids])
+    check_coordinates(kind, content.xyz, xyz)
+    np.testing.assert_array_equal(content.colors, np.array(class_colors(SEMANTICKITTI))[ids])
     if with_uncertain:
         np.testing.assert_array_equal(content.uncertain, uncertain)
     else:
@@ -164,7 +191,7 @@ def test_the_files_can_be_read_as_scans_again(kind: str, tmp_path: Path) -> None
     path = write_scan_labels(
         tmp_path / "a", kind, xyz, ids, taxonomy=SEMANTICKITTI, uncertain=uncertain
     )
-    check_coordinates(read_cloud(path).xyz, xyz)
+    check_coordinates(kind, read_cloud(path).xyz, xyz)
 
 
 # --- errors ---
@@ -249,7 +276,7 @@ def test_predict_writes_the_points_of_the_file_though_the_network_gets_others(
         np.testing.assert_array_equal(content.raw, raw)
         if kind in WITH_POINTS:
             assert content.uncertain is not None
-            check_coordinates(content.xyz, xyz)
+            check_coordinates(kind, content.xyz, xyz)
 
 
 def test_uncertain_points_are_those_of_the_segmenter(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,6 +21,7 @@ import torch
 
 import amvnet
 from amvnet.cli.options import load_segmenter
+from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -407,33 +410,62 @@ def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) 
     check_same(tmp_path / "out", whole)
 
 
-ENTRIES = [Entry(name, "0f", "drive", 10, 3) for name in "ab"]
+ENTRIES = [Entry(name, "0f", "drive", 10, 3, [1]) for name in "ab"]
 
 
-def test_the_folder_of_another_run_is_named_in_a_warning(
-    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_folder_of_another_run_takes_other_scans_only_if_told_so(
+    world: Path, tmp_path: Path
 ) -> None:
-    scan = world / "scans/000000.bin"
     command = f"--weights {world}/{WEIGHTS} --out {tmp_path}"
-    succeed(f"predict {scan} {command}")
-    assert "earlier run" not in capsys.readouterr().out
-    succeed(f"predict {scan} {command} --overwrite --method rv")  # leaves nothing of the other
-    assert "earlier run" not in capsys.readouterr().out
+    succeed(f"predict {world}/scans/000000.bin {command}")
 
-    succeed(f"predict {world}/scans/000001.bin {command}")
-    warning = "the labels of 1 scan of an earlier run, made with other values of method; give"
-    assert warning in capsys.readouterr().out
+    other = f"predict {world}/scans/000001.bin {command}"
+    before = files(tmp_path)
+    assert "1 scan of an earlier run" in refusal(other)
+    assert files(tmp_path) == before
+    succeed(f"{other} --resume")
+    succeed(f"predict {world}/scans/000002.bin {command} --overwrite --method rv")
+    assert {f"00000{index}.label" for index in range(3)} <= files(tmp_path)
+
+
+def test_the_end_counts_the_classes_of_the_label_files_and_names_commands_that_run(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("webbrowser.open", lambda url: None)
+    out = tmp_path / "labels of a drive"
+    arguments = [f"{world}/scans", "--weights", f"{world}/{WEIGHTS}", "--out", str(out)]
+    columns = ["--columns", "x,y,z,intensity"]
+    for options in ([], ["--resume"]):  # the second run only counts
+        assert run_cli("predict", *arguments, *columns, *options)[0] == 0
+        printed = capsys.readouterr().out
+
+    counts: dict[str, int] = {}
+    for path in out.glob("*.label"):
+        ids = SEMANTICKITTI.to_train(np.fromfile(path, np.uint32))
+        for name in np.asarray(SEMANTICKITTI.names)[ids]:
+            counts[name] = counts.get(name, 0) + 1
+    rows = re.findall(r"^ ([\w-]+) +│ +([\d,]+) │ +([\d.]+)", printed, re.M)
+    shown = {name: int(points.replace(",", "")) for name, points, _ in rows}
+    assert shown == counts
+    assert sum(float(share) for *_, share in rows) == pytest.approx(100, abs=1)
+
+    view = re.search(r"^look at them: amvnet (.*)$", printed, re.M)
+    train = re.search(r"^train on your labels.*: amvnet (train .*)$", printed, re.M)
+    assert view is not None
+    assert train is not None
+    assert run_cli(*shlex.split(view[1]))[0] == 0
+    assert "--data YOURS.yaml" in train[1]
 
 
 @pytest.mark.parametrize(
     ("text", "done"),
     [
-        ('["a","0f","drive",10,3]\n["b","0f","drive",10,3]\n', 2),
-        ('["a","0f","drive",10,3]\n["b","0f","drive",10,3]', 1),
-        ('["a","0f","drive",10,3]\n["b","0f', 1),
-        ('["a","0f","drive",10,3]\n\x00\n["b","0f","drive",10,3]\n{}\n', 2),
-        ('["a","0f","drive",10,3]\n["b","0f","drive","10",3]\n"b"\n', 1),
-        ('["a","0f","drive",10,3]\n' + "[" * 100_000 + "\n", 1),
+        ('["a","0f","drive",10,3,[1]]\n["b","0f","drive",10,3,[1]]\n', 2),
+        ('["a","0f","drive",10,3,[1]]\n["b","0f","drive",10,3,[1]]', 1),
+        ('["a","0f","drive",10,3,[1]]\n["b","0f', 1),
+        ('["a","0f","drive",10,3,[1]]\n\x00\n["b","0f","drive",10,3,[1]]\n{}\n', 2),
+        ('["a","0f","drive",10,3,[1]]\n["b","0f","drive","10",3,[1]]\n"b"\n', 1),
+        ('["a","0f","drive",10,3,[1]]\n' + "[" * 100_000 + "\n", 1),
     ],
 )
 def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, text: str, done: int) -> None:
@@ -509,7 +541,7 @@ def test_what_a_killed_run_left_half_written_is_taken_away(
         part.write_bytes(b"complete")
     part.write_bytes(b"half")  # under the name that a file has until it is whole
     with Journal(tmp_path, settings_of(world)) as journal:
-        journal.add(Entry("000000.npz", "", "", 1, 0))
+        journal.add(Entry("000000.npz", "", "", 1, 0, []))
 
     succeed(predict(world, tmp_path, "--overwrite"))
     assert files(tmp_path) == files(whole) | {".notes.part"}

@@ -27,6 +27,7 @@ from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lasers import SensorGeometry, measure
 from amvnet.sensors.lidars import (
     AXES,
+    BUILT_IN,
     KNOWN_HEIGHTS,
     KNOWN_SENSORS,
     Sensor,
@@ -35,7 +36,7 @@ from amvnet.sensors.lidars import (
 )
 from amvnet.sensors.measure import MEASURED_SCANS, raise_points
 from amvnet.sensors.normalise import Normaliser, _row_view
-from amvnet.weights.file import save
+from amvnet.weights.file import built_in, load, save
 from lidarstreets import LIDAR_MODELS
 
 from fixtures.commands import fails, files, run_cli
@@ -283,6 +284,22 @@ def test_what_was_assumed_is_said_once_for_a_source() -> None:
     assert len(lines) == 2
 
 
+@pytest.mark.parametrize(
+    ("laser", "advice"), [("hdl32e", "sim-hdl32e would fit"), ("vlp16", "no built-in weights have")]
+)
+def test_a_warning_about_another_sensor_names_built_in_weights_that_fit(
+    laser: str, advice: str
+) -> None:
+    normaliser, lines = make_normaliser()
+    points, _ = place(LASERS[laser], 1.7)
+    normaliser(make_cloud(points), "drive")
+    assert lines[0].endswith(f"have seen no such sensor; {advice}")
+
+
+def test_the_table_of_built_in_weights_has_the_sensors_of_their_files() -> None:
+    assert {name: load(name).sensor for name in built_in()} == BUILT_IN
+
+
 def test_the_sensor_of_the_training_is_said_to_be_familiar_and_in_place() -> None:
     points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
     normaliser, lines = make_normaliser()
@@ -487,7 +504,8 @@ def test_a_bag_is_segmented_scan_by_scan(
         expected_files |= {f"drive/{index:06d}.label", f"drive/{index:06d}.npz"}
     assert files(tmp_path) == expected_files
 
-    assert run_cli("predict", world / "robot.bin", *options)[0] == 0
+    assert run_cli("predict", world / "robot.bin", *options, "--resume")[0] == 2
+    assert run_cli("predict", world / "robot.bin", *options, "--overwrite")[0] == 0
     expected = (tmp_path / "robot.label").read_bytes()
     for path in (tmp_path / "drive").glob("*.label"):
         assert path.read_bytes() == expected

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.viewing.page import write_page
 from amvnet.viewing.shown_scans import ShownScan
@@ -30,7 +32,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         points = rng.uniform((-15, -15, -2, 0), (15, 15, 2, 1), (2000, 4)).astype(np.float32)
         truth = rng.integers(1, 20, 2000)
         labels = np.where(rng.random(2000) < 0.3, 1, truth)
-        scans.append(ShownScan(name, points, np.ones(2000, bool), truth, {"labels": labels}))
+        shown = ShownScan(name, points, np.ones(2000, bool), truth, {"labels": labels})
+        scans.append(replace(shown, corrected=f"site/truth/{name[2:]}.npy"))
     path = tmp_path_factory.mktemp("page") / "p.html"
     write_page(path, scans, SEMANTICKITTI, "tools")
     return path
@@ -57,14 +60,15 @@ def test_a_box_that_is_none_hides_nothing(page: Path, browser: Browser, box: str
     assert sum(state["drawn"]) == 2000
 
 
-def test_corrected_labels_are_saved_as_predict_writes_them(
-    page: Path, tmp_path: Path, browser: Browser
+@pytest.mark.parametrize("ending", ["label", "npy", "txt", "bin"])
+def test_corrected_labels_are_saved_in_the_form_of_their_place(
+    ending: str, page: Path, tmp_path: Path, browser: Browser
 ) -> None:
     script = f"""
         editor.apply({PERSON});
         editor.apply(1);
         editor.undo();
-        const saved = new Uint8Array(labelFile(scan.planes.corrected, about.raw));
+        const saved = labelFile("a/b.{ending}", scan.planes.corrected, about.raw);
         document.title = [...saved].map((byte) => byte.toString(16).padStart(2, "0")).join("");
     """
     opened = with_script(page, tmp_path / "p.html", script)
@@ -73,9 +77,21 @@ def test_corrected_labels_are_saved_as_predict_writes_them(
     _, planes = read_page(page).scan(0)
     expected = np.where(in_box(page), PERSON, planes["labels"])
     raw = np.array(SEMANTICKITTI.train_to_raw, "<u4")[expected]
-    assert state["title"] == raw.tobytes().hex()
+    path = tmp_path / f"b.{ending}"
+    path.write_bytes(bytes.fromhex(state["title"]))
+    np.testing.assert_array_equal(read_raw_labels(path, 2000, missing=0), raw)
     assert state["console"] == []
     assert state["drawn"][PERSON] == in_box(page).sum()
+
+
+def test_a_download_is_named_by_its_place_in_the_dataset(
+    page: Path, tmp_path: Path, browser: Browser
+) -> None:
+    script = f"editor.apply({PERSON}); saveFile = (blob, name) => {{ document.title = name; }};"
+    script += "editor.save(); document.title += byId('edited').textContent"
+    state = browser.state(with_script(page, tmp_path / "p.html", script))
+    name = "site-truth-000.npy"
+    assert state["title"] == f"{name}Saved as {name}; its place is site/truth/000.npy."
 
 
 def test_a_scan_that_is_not_whole_cannot_be_corrected(tmp_path: Path, browser: Browser) -> None:

@@ -23,7 +23,7 @@ from amvnet.config.nested import to_dict
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.inference.segmentation import Segmentation
-from amvnet.weights.file import PARTS, Weights, load, save
+from amvnet.weights.file import PARTS, Weights, built_in, load, save
 
 from fixtures.tiny import fresh_weights, street
 
@@ -172,3 +172,26 @@ def test_a_file_that_is_not_weights_is_refused_in_one_line(
     with pytest.raises(InputError) as error:
         load(broken)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("miou", "uncertain", "words"),
+    [
+        (0.14, 0.94, ["mIoU of only 14.0%", "94.0% uncertain"]),
+        (0.14, 0.2, ["14.0%"]),
+        (0.6, 0.94, ["94.0%"]),
+        (0.6, 0.2, []),
+        (None, None, []),
+    ],
+)
+def test_weights_say_if_their_own_validation_was_poor(
+    weights: Weights, miou: float | None, uncertain: float | None, words: list[str]
+) -> None:
+    known = {"val/miou_present": miou, "val/uncertain": uncertain}
+    weakness = replace(weights, metrics={"point_head": known}).weakness
+    assert bool(weakness) == bool(words)
+    assert all(word in weakness for word in words)
+
+
+def test_the_built_in_weights_have_no_weakness() -> None:
+    assert [load(name).weakness for name in built_in()] == ["", ""]

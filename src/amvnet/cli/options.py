@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from amvnet.cli.console import report, silence
+from amvnet.cli.parser import flag_of
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 # Only nuScenes has the last two splits.
 Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
 
-FormatName = Literal["label", "npy", "ply"]  # the format of label files for scan files
+# The format of label files for scan files.
+FormatName = Literal["label", "npy", "ply", "pcd", "las", "laz"]
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 MAX_SEQUENCES = 20  # largest number of sequences that a line names
@@ -200,7 +202,8 @@ class LabelChoice:
     """a point goes to the head if the cosine similarity of the two networks' probabilities is at
     most this value, in [0, 1]; a lower value takes less time; default: the value in the weights."""
     format: FormatName = "label"
-    """the format of the labels of scan files: raw ids (label, npy), or coloured points (ply)."""
+    """the format of the labels of scan files: raw ids (label, npy), or coloured points (ply, pcd,
+    las, laz)."""
     classes: str | None = None
     """other classes, to which the classes of the weights are mapped: coarse, lidog, or a YAML
     file."""
@@ -303,6 +306,17 @@ class ScoresChoice:
             ScoreFolder("a", self.scores_a, self.logits in ("a", "both")),
             ScoreFolder("b", self.scores_b, self.logits in ("b", "both")),
         )
+
+
+def given(choice: Any) -> list[str]:
+    """Return the options of a choice whose values are not the defaults, as words of a command."""
+    words = []
+    for field in fields(choice):
+        value = getattr(choice, field.name)
+        if value != field.default:
+            text = ",".join(value) if isinstance(value, tuple) else str(value)
+            words.append(f"{flag_of(field.name)}={text}")
+    return words
 
 
 def load_segmenter(

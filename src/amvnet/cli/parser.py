@@ -17,6 +17,7 @@ import docstring_parser
 from amvnet.cli.console import report_lines
 from amvnet.config.bounds import Range
 from amvnet.errors import InputError, did_you_mean, shown
+from amvnet.sensors.lidars import BUILT_IN
 
 OF_THIS_NAME = "for the file of this name, give"  # advice about a file that looks like an option
 NUMBERS = {int: "a whole number", float: "a number"}  # what messages call the types of numbers
@@ -57,7 +58,8 @@ class Parser(argparse.ArgumentParser):
         elif missing is not None:
             # A misspelt option helps the user more than the missing option.
             wrong = self._wrong_option()
-            line = f"expected {missing[1]}, found none; add what is missing"
+            built_in = f" (built in: {', '.join(BUILT_IN)})" if "--weights" in missing[1] else ""
+            line = f"expected {missing[1]}, found none; add what is missing{built_in}"
             line = line if wrong is None else self._unknown(wrong)
         is_advice = line.endswith("?") or OF_THIS_NAME in line
         raise InputError(line if is_advice else f"{line}; see {self.prog} --help")

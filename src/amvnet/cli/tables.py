@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import platform
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
@@ -82,6 +83,26 @@ def contents_table(report: Report) -> Table:
     for split in splits.values():
         totals += [f"{int(split.points.sum()):,}", "", str(len(split.scans))]
     table.add_row("all", *totals)
+    return table
+
+
+def labelled_table(counts: Sequence[Sequence[int]], taxonomy: Taxonomy) -> Table:
+    """Return the table of the points of each class in the labels of some scans, most first.
+
+    Args:
+        counts: for each scan, the number of points of each train id, from 0.
+        taxonomy: the classes of the labels.
+    """
+    totals = Counter[str]()
+    for of_scan in counts:
+        totals.update(dict(zip(taxonomy.names, of_scan, strict=False)))
+    table = Table(show_edge=False)
+    table.add_column("class")
+    table.add_column("points", justify="right")
+    table.add_column("in %", justify="right")
+    for name, points in totals.most_common():
+        if points:
+            table.add_row(name, f"{points:,}", _percent(points / totals.total()))
     return table
 
 

@@ -1,13 +1,13 @@
-"""The colours of classes and of marked points in all drawings.
+"""The colours of classes and of marked points: in files of points, in the viewer and in charts.
 
-Label files carry the official colours. Some of these look alike in a picture, or cannot be seen on
-a dark background.
+Some official colours look alike in a picture, or cannot be seen on a dark background.
 """
 
 from __future__ import annotations
 
 from amvnet.data.taxonomy import Color, Taxonomy
 
+UNLABELLED: Color = (128, 136, 148)  # officially black
 WRONG: Color = (255, 64, 54)
 UNCERTAIN: Color = (255, 150, 180)  # no class of either benchmark has a similar colour
 
@@ -28,9 +28,9 @@ DRAWN: dict[str, dict[str, Color]] = {
 
 
 def class_colors(taxonomy: Taxonomy) -> tuple[Color, ...]:
-    """Return the K + 1 colours of the classes in drawings, RGB in 0..255, by train id."""
+    """Return the K + 1 colours of the classes, RGB in 0..255, by train id."""
     drawn = DRAWN.get(taxonomy.name, {})
-    colors = []
-    for name, color in zip(taxonomy.names, taxonomy.colors, strict=True):
+    colors = [UNLABELLED]
+    for name, color in zip(taxonomy.classes, taxonomy.colors[1:], strict=True):
         colors.append(drawn.get(name, color))
     return tuple(colors)

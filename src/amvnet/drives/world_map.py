@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -12,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from amvnet.data.class_maps import class_map
-from amvnet.data.labels.writers import write_ply
+from amvnet.data.labels.clouds import COLORS, check_laspy, write_cloud
+from amvnet.data.palette import class_colors
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.drives.consensus import STEPS, VoxelTable, index_of, keys_of, sum_by, weighted_logs
@@ -21,9 +21,6 @@ from amvnet.files import atomic_write
 from amvnet.outputs import Signature
 
 MOVABLE = ("vehicle", "two-wheeler", "person")  # coarse classes whose points may move
-FULL_COLOR = 257  # colours of LAS have 16 bits: 255 * 257 = 65535
-MILLIMETRE = 0.001
-LAS_FORMAT = 7  # the point format of LAS 1.4 with colours and classes up to 255
 
 _PLY = (
     rb"ply\nformat binary_little_endian 1\.0\nelement vertex \d+\n"
@@ -73,38 +70,14 @@ class WorldMap:
             InputError: if the ending is another one, or laspy is missing.
         """
         check_ending(path)
-        colors = np.asarray(self.taxonomy.colors, np.uint8)[self.labels]
-        raw = self.taxonomy.to_raw(self.labels)
-        if path.suffix != ".ply":
-            self._write_las(path, colors, raw)
-            return
-
+        colors = np.asarray(class_colors(self.taxonomy), np.uint8)[self.labels]
         columns = dict(zip("xyz", self.xyz.T, strict=True))
-        columns |= dict(zip(("red", "green", "blue"), colors.T, strict=True))
-        columns["class"] = raw.astype(np.int32)
+        columns |= dict(zip(COLORS, colors.T, strict=True))
+        columns["class"] = self.taxonomy.to_raw(self.labels).astype(np.int32)
         columns["confidence"] = self.confidence
         columns["sights"] = self.sights
         with atomic_write(path) as part:
-            write_ply(part, columns)
-
-    def _write_las(self, path: Path, colors: np.ndarray, raw: np.ndarray) -> None:
-        import laspy
-
-        header = laspy.LasHeader(point_format=LAS_FORMAT, version="1.4")
-        header.generating_software = PROGRAM
-        header.add_extra_dims(
-            [laspy.ExtraBytesParams("confidence", "f4"), laspy.ExtraBytesParams("sights", "u2")]
-        )
-        header.offsets = self.xyz.min(axis=0).round() if len(self) else np.zeros(3)
-        header.scales = np.full(3, MILLIMETRE)
-        cloud = laspy.LasData(header)
-        cloud.x, cloud.y, cloud.z = self.xyz.T
-        cloud.red, cloud.green, cloud.blue = colors.T.astype(np.uint16) * FULL_COLOR
-        cloud.classification = raw.astype(np.uint8)
-        cloud.confidence = self.confidence
-        cloud.sights = self.sights
-        with atomic_write(path) as part:
-            cloud.write(part, do_compress=path.suffix == ".laz", laz_backend=laspy.LazBackend.Lazrs)
+            write_cloud(part, path.suffix, columns, PROGRAM)
 
 
 class MapBuilder:
@@ -222,8 +195,4 @@ def check_ending(path: Path) -> None:
             f"{path}: expected a name that ends in {', '.join(SIGNATURES)}, found "
             f"{path.suffix or 'no ending'}; rename it"
         )
-    if path.suffix != ".ply" and find_spec("laspy") is None:
-        raise InputError(
-            f"{path}: expected the package laspy for this format, found none; run pip install "
-            '"amvnet[formats]", or write .ply'
-        )
+    check_laspy(path, path.suffix)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, remove_unfinished
-from amvnet.progress import counted
 
 JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
 UNFINISHED = ".unfinished.jsonl"  # the name of the journal during the run
+KINDS = [str, str, str, int, int, list]  # the types of the values of an `Entry` in JSON
 
 
 class Entry(NamedTuple):
@@ -26,6 +26,7 @@ class Entry(NamedTuple):
         sensor: the name of the recording, whose scans have one sensor.
         points: the number of valid points.
         uncertain: the number of uncertain points: `points` times `Segmentation.doubt`.
+        counts: the number of points of each train id that was written, from 0.
     """
 
     scan: str
@@ -33,6 +34,7 @@ class Entry(NamedTuple):
     sensor: str
     points: int
     uncertain: int
+    counts: list[int]
 
 
 class Journal:
@@ -116,26 +118,6 @@ def read_journals(folder: Path) -> EarlierRun:
     return run
 
 
-def describe_other_run(folder: Path, settings: Mapping[str, Any], scans: Set[str]) -> str:
-    """Describe the labels that stay in a folder from an earlier run; return "" if there are none.
-
-    Args:
-        folder: the folder that the new run is about to write into.
-        settings: the settings of the new run, as `Journal` takes them.
-        scans: the names of the new run's scans, whose files it replaces.
-    """
-    earlier = read_journals(folder)
-    others = earlier.entries.keys() - scans
-    if not others:
-        return ""
-
-    changed = set(earlier.changed(settings))
-    text = f"{folder} has the labels of {counted(len(others), 'scan')} of an earlier run"
-    if changed:
-        text += f", made with other values of {', '.join(sorted(changed))}"
-    return f"{text}; give each run a folder of its own"
-
-
 def changed_settings(settings: Mapping[str, Any], earlier: Mapping[str, Any]) -> list[str]:
     """Return the settings of a run that have another value in an earlier run."""
     return [key for key in settings if settings[key] != earlier.get(key)]
@@ -177,7 +159,7 @@ def _read(path: Path) -> tuple[dict[str, Any], list[Entry]]:
     entries = []
     for line in lines[1:]:
         values = _from_line(line)
-        if isinstance(values, list) and list(map(type, values)) == [str, str, str, int, int]:
+        if isinstance(values, list) and list(map(type, values)) == KINDS:
             entries.append(Entry(*values))
     return settings, entries
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -70,9 +71,11 @@ class InputScan(ABC):
         path: the file that holds the scan.
         scores_path: the path of the `.npz` of its scores, relative to a folder of predictions.
         bag: the poses of the bag that holds the scan; None if no bag does.
+        corrected: the place of the scan's corrected labels, relative to the folder of the dataset.
     """
 
     bag: BagPoses | None = None
+    corrected: str
 
     def __init__(self, name: str, title: str, source: str, path: Path, scores_path: Path) -> None:
         self.name = name
@@ -149,6 +152,8 @@ class DatasetScan(InputScan):
         self.dataset = dataset
         self.record = record
         self.written = written
+        place = dataset.place_of_labels(record)
+        self.corrected = Path(os.path.relpath(place, dataset.root)).as_posix()
 
     @property
     def files(self) -> list[Path]:
@@ -249,6 +254,7 @@ class FileScan(InputScan):
     def __init__(self, scan: NamedScan, reader: FileReader, taxonomy: Taxonomy) -> None:
         super().__init__(scan.name, scan.name, scan.source, scan.path, Path(f"{scan.name}.npz"))
         self.bag = scan.bag_poses
+        self.corrected = f"{scan.name}.label"
         self.scan = scan
         self.reader = reader
         self.taxonomy = taxonomy

@@ -285,7 +285,8 @@ class Pipeline:
         points = int(np.count_nonzero(loaded.scan.valid))
         uncertain = round(result.doubt * points)
         key = _key(scan)
-        return Entry(key, self._origins[key], scan.source, points=points, uncertain=uncertain)
+        counts = np.bincount(result.labels).tolist()
+        return Entry(key, self._origins[key], scan.source, points, uncertain, counts)
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:
@@ -312,18 +313,26 @@ def check_output(scans: Sequence[InputScan], output: OutputOptions) -> None:
 
     Raises:
         InputError: if two scans would have the same files, a scan and its output would have the
-            same folder, or a file may not be written.
+            same folder, a file may not be written, or the folder has other scans' labels of an
+            earlier run, which is neither resumed nor overwritten.
     """
     folder = output.folder
-    earlier = read_journals(folder).entries if output.resume else {}
+    earlier = read_journals(folder).entries
     _check_names(scans)
+    others = earlier.keys() - {_key(scan) for scan in scans}
+    if others and not (output.resume or output.overwrite):
+        raise InputError(
+            f"{folder}: expected a new folder, found the labels of {counted(len(others), 'scan')} "
+            "of an earlier run; write to another folder, or say --resume to go on with that run, "
+            "or --overwrite to keep its labels beside the new ones"
+        )
     inputs = list(output.also_read)
     own_files: list[Path] = []
     new_files: dict[Path, Signature] = {}
     for scan in scans:
         inputs += scan.files
         for path, signature in output.files_of(scan).items():
-            if _key(scan) in earlier:
+            if output.resume and _key(scan) in earlier:
                 own_files.append(inside(folder, path))
             else:
                 new_files[inside(folder, path)] = signature

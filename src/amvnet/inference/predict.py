@@ -8,9 +8,9 @@ from dataclasses import replace
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.drive import DriveChoice, Drives, find_poses, key_of
-from amvnet.inference.journal import Entry, describe_other_run
+from amvnet.inference.journal import Entry
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_faults, check_output
+from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_output
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
@@ -37,7 +37,7 @@ def predict(
     batch: int = 1,
     progress: Progress = no_progress,
     report: Reporter = report_nothing,
-) -> int:
+) -> tuple[list[Entry], list[str]]:
     """Segment datasets, scan files, bags and folders of them.
 
     Args:
@@ -53,17 +53,14 @@ def predict(
             alone.
         batch: the number of scans that go through the networks together.
         progress: called with the number of scans that are done, and their total.
-        report: takes lines about what was assumed of the sensor; at the end, if there are two
-            networks, takes a line about how sure the labels are.
+        report: takes lines about what was assumed of the sensor.
 
     Returns:
-        The number of label files of these scans, including the files of the run that is resumed.
+        The entries of the scans that are labelled, including scans of the run that is resumed; and
+        a line for each scan that is broken.
 
     Raises:
-        InputError: before anything is written, if an input is missing, the scans and the output
-            have the same folder, or a file of the user would be replaced; at the end, if every scan
-            is broken.
-        SomeBroken: at the end, if some of several scans are broken.
+        InputError: before anything is written, if an input is missing, or `check_output` raises it.
     """
     classes = request.classes
     normaliser = Normaliser(request.weights.expects, request.sensor, report)
@@ -85,16 +82,7 @@ def predict(
         at_once=segmenter.at_once,
         drives=drives,
     )
-    if not output.resume:
-        names = {str(scan.scores_path) for scan in scans}
-        other_run = describe_other_run(output.folder, request.settings, names)
-        if other_run:
-            report(f"warning: {other_run}")
-    entries, faults = pipeline.run(request.settings, progress)
-
-    report_certainty(entries, segmenter.method, segmenter.usual_uncertain, report)
-    check_faults(faults, len(scans))
-    return len(scans)
+    return pipeline.run(request.settings, progress)
 
 
 def segment_by(

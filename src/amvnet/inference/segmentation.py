@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from amvnet.data.labels.writers import KINDS, SIGNATURES, write_scan_labels
+from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, did_you_mean
 from amvnet.models.amvnet import Scores
 from amvnet.models.methods import METHODS
 from amvnet.outputs import check_outputs
@@ -157,12 +158,29 @@ class Segmentation:
 
     def _most_frequent(self) -> str:
         """Return the most frequent classes and their shares, as text."""
+        shown = list(self.counts().items())[:SHOWN_CLASSES]
+        return ", ".join(f"{count / len(self):.0%} {name}" for name, count in shown)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of points of each class that occurs, by its name, most first."""
         counts = np.bincount(self.labels, minlength=len(self.class_names))
-        texts = []
-        for index in np.argsort(-counts, kind="stable")[:SHOWN_CLASSES]:
-            if counts[index]:
-                texts.append(f"{counts[index] / len(self):.0%} {self.class_names[index]}")
-        return ", ".join(texts)
+        order = np.argsort(-counts, kind="stable")
+        return {self.class_names[index]: int(counts[index]) for index in order if counts[index]}
+
+    def mask(self, *names: str) -> NDArray[np.bool_]:
+        """Return (N,) bool: which points have one of these classes, such as "car".
+
+        Raises:
+            InputError: if there is no such class.
+        """
+        for name in names:
+            if name not in self.class_names:
+                advice = f"name one of {', '.join(self.class_names)}"
+                raise InputError(
+                    f"expected a class of the result, found {name!r}"
+                    + did_you_mean(name, self.class_names, advice)
+                )
+        return np.isin(self.labels, [self.class_names.index(name) for name in names])
 
     @property
     def has_two_networks(self) -> bool:
@@ -187,6 +205,12 @@ class Segmentation:
         return largest
 
     @property
+    def points(self) -> NDArray[np.floating]:
+        """(N, 3) x, y, z of the points, as in the scan's file or in the array that was given."""
+        origin = self.require_origin()
+        return origin.scan.points[:, :3] if origin.file_xyz is None else origin.file_xyz
+
+    @property
     def class_names(self) -> tuple[str, ...]:
         """K + 1 names of the classes, by id; the name of id 0 is "unlabelled"."""
         return self.require_origin().taxonomy.names
@@ -194,7 +218,7 @@ class Segmentation:
     @property
     def colors(self) -> NDArray[np.uint8]:
         """(K + 1, 3) RGB colours of the classes in 0..255, by id: `colors[labels]` is (N, 3)."""
-        return np.asarray(self.require_origin().taxonomy.colors, dtype=np.uint8)
+        return np.asarray(class_colors(self.require_origin().taxonomy), dtype=np.uint8)
 
     @property
     def raw_ids(self) -> NDArray[np.uint32]:
@@ -233,8 +257,9 @@ class Segmentation:
     def save(self, path: Path | str) -> Path:
         """Write the labels, in the format that the path's ending names; replace earlier labels.
 
-        `.label` and `.npy` hold the raw ids. `.ply` holds the points, coloured by class, with the
-        coordinates of the scan's file. `write_scan_labels` describes the formats.
+        `.label` and `.npy` hold the raw ids. `.ply`, `.pcd`, `.las` and `.laz` hold the points,
+        coloured by class, with their `points` as coordinates. `write_scan_labels` describes the
+        formats.
 
         Returns:
             The path.
@@ -253,11 +278,10 @@ class Segmentation:
             )
         check_outputs({path: SIGNATURES[path.suffix]}, [origin.path], overwrite=True)
 
-        xyz = origin.scan.points[:, :3] if origin.file_xyz is None else origin.file_xyz
         return write_scan_labels(
             path.with_suffix(""),
             kind,
-            xyz,
+            self.points,
             self.labels,
             origin.taxonomy,
             uncertain=self.uncertain if self.has_two_networks else None,

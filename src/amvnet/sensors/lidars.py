@@ -20,6 +20,9 @@ from amvnet.errors import InputError, did_you_mean, errors_of, shown
 # Heights of the sensors over the ground on the cars that recorded KITTI and nuScenes, metres.
 KNOWN_HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
 
+# The sensors that the built-in weights are trained for, by the name of the weights.
+BUILT_IN = {"sim-hdl32e": "hdl32e", "sim-hdl64e": "hdl64e"}
+
 # Rotations that turn a file's x, y, z into forward, left, up, by the name of the file's axes.
 AXES = {
     "x-forward": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # x forward, y left, z up: ROS, KITTI

@@ -19,7 +19,7 @@ from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.frame import Frame
 from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
 from amvnet.sensors.lasers import SensorGeometry, elevations
-from amvnet.sensors.lidars import Sensor, rotation_from_degrees
+from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, Sensor, rotation_from_degrees
 from amvnet.sensors.measure import (
     MEASURED_SCANS,
     Estimate,
@@ -91,8 +91,17 @@ def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expecta
     name = trained.name or "a sensor"
     return (
         f"{line}; the weights were trained for {name} ({describe_lasers(expected.lasers)}) "
-        "and have seen no such sensor"
+        f"and have seen no such sensor; {_suited_to(lasers)}"
     )
+
+
+def _suited_to(lasers: SensorGeometry) -> str:
+    """Return in words which built-in weights have seen such lasers."""
+    names = []
+    for name, sensor in BUILT_IN.items():
+        if lasers.is_like(SensorGeometry().override(KNOWN_SENSORS[sensor])):
+            names.append(name)
+    return f"{' and '.join(names)} would fit" if names else "no built-in weights have"
 
 
 class Normaliser:

@@ -22,13 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.evaluation.metrics import OVERALL, Evaluation
 from amvnet.files import atomic_write, unfinished
+from amvnet.inference.reading import checked_scan
 from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
 from amvnet.outputs import Signature, check_outputs
-from amvnet.viewing.shown_scans import RIGHT, UNLABELLED, UNSCORED, ShownScan, shown_scan
+from amvnet.scan import AnyArray, Scan
+from amvnet.viewing.shown_scans import (
+    RIGHT,
+    UNSCORED,
+    ShownScan,
+    short_name,
+    shown_scan,
+)
 
 # Largest number of points of a scan that the page shows. The page shows every second or third point
 # of a larger scan, so that phones keep up.
@@ -78,42 +86,60 @@ class Packed:
     intensity: float
 
 
-def show(result: Segmentation, path: Path | str | None = None, open_browser: bool = True) -> Path:
-    """Write a page that shows a segmented scan in 3D, open it, and return its path.
+def show(
+    shown: Segmentation | Scan | AnyArray,
+    path: Path | str | None = None,
+    open_browser: bool = True,
+) -> Path:
+    """Write a page that shows a scan in 3D, open it, and return its path.
 
-    The page shows the labels, the labels of each network, the uncertain points and, if the scan has
-    a ground truth, the errors.
+    Of a result, the page shows the labels, the labels of each network, the uncertain points and, if
+    the scan has a ground truth, the errors.
 
     Args:
-        result: the result of a `Segmenter`.
-        path: the file, NAME.html, which may replace an earlier page; by default a file in a
-            temporary folder.
+        shown: the result of a `Segmenter`; or a scan or an array of points, as a `Segmenter` takes
+            it.
+        path: the file, which may replace an earlier page and gets the ending `.html` if it has
+            none; by default a file in a temporary folder.
         open_browser: also open the page.
 
     Raises:
-        InputError: if the file cannot be written, or holds something other than a page.
+        InputError: if no point is valid, or the file cannot be written or holds something other
+            than a page.
     """
-    origin = result.require_origin()
-    if path is not None:
-        check_outputs({Path(path): PAGE}, [origin.path], overwrite=True)
-    title = Path(origin.scan.name).name or "scan"
-    shown = shown_scan(result, origin)
-    with place_for_page(path) as page:
-        write_page(page, [shown], origin.taxonomy, title)
+    if isinstance(shown, Segmentation):
+        origin = shown.require_origin()
+        scan, taxonomy, source = origin.scan, origin.taxonomy, origin.path
+        content = shown_scan(shown, origin)
+    else:
+        scan, taxonomy, source = checked_scan(shown), SEMANTICKITTI, None
+        content = ShownScan(short_name(scan), scan.points, scan.valid, truth=scan.labels)
+
+    page_path = None if path is None else page_name(path)
+    if page_path is not None:
+        check_outputs({page_path: PAGE}, [source], overwrite=True)
+    with place_for_page(page_path) as page:
+        write_page(page, [content], taxonomy, short_name(scan))
     if open_browser:
         open_page(page)
 
     return page
 
 
+def page_name(path: Path | str) -> Path:
+    """Return the path of a page, with the ending `.html` if it has none of a page."""
+    path = Path(path)
+    return path if path.suffix.lower() in (".html", ".htm") else path.with_name(f"{path.name}.html")
+
+
 @contextmanager
-def place_for_page(path: Path | str | None) -> Iterator[Path]:
+def place_for_page(path: Path | None) -> Iterator[Path]:
     """Yield the path, or else a path in a new temporary folder.
 
     The temporary folder stays if the page is written in the block.
     """
     if path is not None:
-        yield Path(path)
+        yield path
         return
 
     folder = Path(tempfile.mkdtemp(prefix="amvnet-"))
@@ -195,6 +221,7 @@ def pack(shown: ShownScan) -> Packed:
         "name": shown.name,
         "count": len(indices),
         "note": "; ".join(notes),
+        "corrected": shown.corrected,
         "center": center.tolist(),
         "step": step.tolist(),
         "planes": list(planes),
@@ -268,7 +295,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     return {
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
-        "colors": [UNLABELLED, *class_colors(taxonomy)[1:]],
+        "colors": class_colors(taxonomy),
         "raw": taxonomy.train_to_raw,
         "present": sorted(present),
         "sources": sources,

@@ -24,11 +24,9 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import Scores
 from amvnet.models.assertion import cosine_similarity
 from amvnet.progress import Progress, no_progress
-from amvnet.scan import check_scan
+from amvnet.scan import Scan, check_scan
 
-# Colours for a dark background, RGB in 0..255. Points without a class get a grey, because their
-# official colour is black.
-UNLABELLED = (128, 136, 148)
+# Colours for a dark background, RGB in 0..255.
 RIGHT = (78, 92, 112)
 UNSCORED = (40, 47, 58)
 
@@ -51,6 +49,8 @@ class ShownScan:
             paper); None without two networks.
         disagreement: (N,) float32 in [0, 1], 1 - the cosine similarity of the two networks' class
             probabilities; None without two networks.
+        corrected: the place of the scan's corrected labels, relative to the folder of the dataset;
+            its ending names their form. Empty if the scan has no such place.
     """
 
     name: str
@@ -63,6 +63,7 @@ class ShownScan:
     second_probability: np.ndarray | None = None
     uncertain: np.ndarray | None = None
     disagreement: np.ndarray | None = None
+    corrected: str = ""
 
 
 def check_labels(labels: Path, count: int) -> None:
@@ -109,9 +110,16 @@ def show_scans(
         if segmenter is not None:
             result = segmenter(scan)
             assert result.origin is not None
-            return replace(shown_scan(result, result.origin), name=scan_input.title)
+            shown = shown_scan(result, result.origin)
+            return replace(shown, name=scan_input.title, corrected=scan_input.corrected)
 
-        shown = ShownScan(scan_input.title, scan.points, scan.valid, truth=scan.labels)
+        shown = ShownScan(
+            scan_input.title,
+            scan.points,
+            scan.valid,
+            truth=scan.labels,
+            corrected=scan_input.corrected,
+        )
         if labels is None:
             return shown
 
@@ -120,6 +128,11 @@ def show_scans(
 
     at_once = 1 if segmenter is None else segmenter.at_once
     return stream_scans(scans, load, show, at_once, progress)
+
+
+def short_name(scan: Scan) -> str:
+    """Return the name of a scan for people, without folders."""
+    return Path(scan.name).name or "scan"
 
 
 def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
@@ -152,7 +165,7 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
 
     second_probability, second = _shares(scores[origin.method]).topk(2, dim=1)
     shown = ShownScan(
-        Path(scan.name).name or "scan",
+        short_name(scan),
         scan.points,
         scan.valid,
         truth=scan.labels,

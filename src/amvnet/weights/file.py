@@ -32,6 +32,11 @@ from amvnet.weights import hub
 
 PARTS = ("range_net", "polar_net", "point_head")  # parts of the method, as `AMVNet` names them
 UNCERTAIN = "val/uncertain"  # metric of the point head: the share of uncertain points
+MIOU = "val/miou_present"  # metric of each part: the mIoU of the classes that it was validated on
+# A validation with a smaller mIoU, or a larger share of uncertain points, says that the weights
+# have hardly learnt: a fine-tuning on a dozen scans has about 0.5 and 0.3.
+POOR_MIOU = 0.3
+POOR_UNCERTAIN = 0.6
 # Share of uncertain points that is usual for weights without this metric: the paper has this share
 # on nuScenes, and `sim-hdl64e` has it on simulated streets.
 USUAL_UNCERTAIN = 0.2
@@ -95,10 +100,29 @@ class Weights:
     @property
     def usual_uncertain(self) -> float:
         """The share of uncertain points in the validation, in [0, 1]; else `USUAL_UNCERTAIN`."""
-        share = self.metrics.get("point_head", {}).get(UNCERTAIN)
-        if isinstance(share, int | float) and 0 <= share <= 1:
-            return float(share)
-        return USUAL_UNCERTAIN
+        share = self._validated("point_head", UNCERTAIN)
+        return USUAL_UNCERTAIN if share is None else share
+
+    @property
+    def weakness(self) -> str:
+        """What the validation of the training says against the weights; "" if nothing does."""
+        found = []
+        known = [miou for part in self.parts if (miou := self._validated(part, MIOU)) is not None]
+        if known and known[-1] < POOR_MIOU:
+            found.append(f"a mIoU of only {known[-1]:.1%}")
+        if self.usual_uncertain > POOR_UNCERTAIN:
+            found.append(f"{self.usual_uncertain:.1%} uncertain points")
+        if not found:
+            return ""
+        return (
+            f"the validation of these weights' own training had {' and '.join(found)}; do not rely "
+            "on the labels: train for more epochs or on more scans"
+        )
+
+    def _validated(self, part: str, name: str) -> float | None:
+        """Return a metric of a part's validation that is a share, or None if it is unknown."""
+        share = self.metrics.get(part, {}).get(name)
+        return float(share) if isinstance(share, int | float) and 0 <= share <= 1 else None
 
     def usual_uncertain_at(self, tau: float | None) -> float | None:
         """Return `usual_uncertain` for the weights' own tau, and None for any other tau."""
@@ -322,6 +346,11 @@ def built_in() -> dict[str, Path]:
     for path in sorted(folder.glob("*.safetensors")):
         paths[path.stem] = path
     return paths
+
+
+def list_weights() -> list[str]:
+    """Return the names of the built-in weights, which `amvnet.load` takes."""
+    return list(built_in())
 
 
 def _find(name_or_path: str) -> Path:

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amvnet.cli.console import progress, report
-from amvnet.cli.options import DriveOptions, LabelChoice, ScanChoice, SensorChoice, load_segmenter
+from amvnet.cli.console import progress, report, show
+from amvnet.cli.options import (
+    DriveOptions,
+    LabelChoice,
+    ScanChoice,
+    SensorChoice,
+    given,
+    load_segmenter,
+)
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
+    from amvnet.data.taxonomy import Taxonomy
     from amvnet.inference.segmenter import Segmenter
 
 
@@ -46,8 +55,11 @@ def predict(
             only scans that are new or were not finished.
         overwrite: replace files that exist.
     """
+    from amvnet.cli.tables import labelled_table
     from amvnet.engines.precision import resolved
+    from amvnet.inference.pipeline import check_faults
     from amvnet.inference.predict import predict as predict_inputs
+    from amvnet.inference.predict import report_certainty
     from amvnet.weights.file import load
 
     for text in (*inputs, out):
@@ -61,7 +73,7 @@ def predict(
         return load_segmenter(request.weights, request.method, compute, request.tau)
 
     with progress("segmenting") as step:
-        written = predict_inputs(
+        entries, faults = predict_inputs(
             inputs,
             request,
             make_segmenter,
@@ -72,4 +84,37 @@ def predict(
             progress=step,
             report=report,
         )
-    report(f"{counted(written, 'label file')} in {out}")
+
+    if entries:
+        show(labelled_table([entry.counts for entry in entries], request.taxonomy))
+    usual = request.weights.usual_uncertain_at(request.tau)
+    report_certainty(entries, request.method, usual, report)
+    if request.weights.weakness:
+        report(f"warning: {request.weights.weakness}")
+    check_faults(faults, len(entries) + len(faults))
+    report(f"{counted(len(entries), 'label file')} in {out}")
+    _report_next(inputs, weights, out, request.taxonomy, [*given(choice), *given(sensor_choice)])
+
+
+def _report_next(
+    inputs: list[str], weights: str, out: str, written: Taxonomy, options: list[str]
+) -> None:
+    """Report the commands that show the labels, and that train the weights further.
+
+    Args:
+        written: the classes of the labels.
+        options: the options by which the scans were read.
+    """
+    from amvnet.data.datasets.open import is_dataset
+    from amvnet.data.taxonomy import TAXONOMIES
+
+    labels = ["--weights", weights]  # `view` knows no other classes of label files
+    if TAXONOMIES.get(written.name) == written:
+        labels = ["--labels", out, "--taxonomy", written.name]
+    datasets = [text for text in inputs if is_dataset(text)]
+    data = datasets[0] if datasets else "YOURS.yaml"
+    source = "" if datasets else " that YOURS.yaml describes (docs/own_data.md)"
+
+    report(f"look at them: {shlex.join(['amvnet', 'view', *inputs, *options, *labels])}")
+    command = ["amvnet", "train", "finetune", "--init", weights, "--data", data]
+    report(f"train on your labels{source}: {shlex.join([*command, '--out', 'runs/finetuned'])}")

@@ -37,7 +37,8 @@ def view(
             of a single scan.
         weights: a weights file, or the name of built-in weights, instead of labels. The page then
             shows the labels of every method.
-        html: the page to write; default: a temporary page, which opens in the browser.
+        html: the page to write, which gets the ending .html if it has none; default: a temporary
+            page, which opens in the browser.
         scans: largest number of scans; they are evenly spaced in the inputs.
         taxonomy: the classes of labels that belong to no dataset.
         overwrite: replace the page if it exists.
@@ -48,7 +49,7 @@ def view(
     from amvnet.inference.listing import list_inputs
     from amvnet.outputs import check_outputs
     from amvnet.sensors.normalise import Normaliser
-    from amvnet.viewing.page import PAGE, open_page, place_for_page, write_page
+    from amvnet.viewing.page import PAGE, open_page, page_name, place_for_page, write_page
     from amvnet.viewing.shown_scans import check_labels, show_scans
     from amvnet.weights.file import load
 
@@ -64,6 +65,7 @@ def view(
     sensor = sensor_choice.parse()
     # Check this before any scan is segmented, so that no time is wasted.
     if html is not None:
+        html = page_name(html)
         check_outputs({html: PAGE}, [*inputs, labels, weights, sensor_choice.sensor], overwrite)
         make_folder(html.parent)
 

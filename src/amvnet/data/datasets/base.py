@@ -204,6 +204,10 @@ class Dataset(ABC):
         """Read the points of one scan as in its file; raise the errors of `read`."""
         return self.read(record, labels=False)
 
+    def place_of_labels(self, record: ScanRecord) -> Path:
+        """Return the file that holds the labels of a scan, or its prediction if none may."""
+        return record.labels_path or self.root / record.prediction
+
     @abstractmethod
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
         """Read the (N,) raw ids of a scan that has labels, with whatever values.

@@ -158,6 +158,14 @@ class OwnScans(Dataset):
         )
         return OwnScans(description, self.normalise)
 
+    def place_of_labels(self, record: ScanRecord) -> Path:
+        """Return the file that holds the labels of a scan, or its prediction if none may."""
+        place = self.description.labels
+        if place is None or place.field is not None:  # labels in a column cannot be replaced alone
+            return self.root / record.prediction
+        scan = self._scans[record.name]
+        return place.path_of(scan.path, scan.name)
+
     def files_of(self, record: ScanRecord) -> list[Path]:
         """Return the files of a scan, with its label file even if labels are not read."""
         files = super().files_of(record)

@@ -19,8 +19,9 @@ from amvnet.errors import InputError, readable
 
 # The types of the ids in files that hold only ids, by bytes per point.
 INTEGERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.int64}
-# The usual names of a column of labels; CloudCompare writes names that begin with "scalar_".
-COLUMNS = ("class", "label", "scalar_class", "scalar_label")
+# The usual names of a column of labels; CloudCompare writes names that begin with "scalar_", and
+# LAS has a classification in any case.
+COLUMNS = ("class", "label", "scalar_class", "scalar_label", "classification")
 # The usual names of an array of labels in an archive.
 ARRAYS = ("labels", "label", "class", "arr_0")
 KEY = "labels"  # the key of the labels among the columns that a reader returns

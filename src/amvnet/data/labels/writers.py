@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
+from amvnet.data.labels.clouds import COLORS, PCD_HEADER, check_laspy, write_cloud
 from amvnet.data.labels.ids import check_count, write_ids
+from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.outputs import Signature
 
-Kind = Literal["label", "npy", "ply"]
+Kind = Literal["label", "npy", "ply", "pcd", "las", "laz"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 # The largest rounding error of coordinates in float32, metres; if it is larger, they are float64.
@@ -25,24 +28,29 @@ _PLY = (
     rb"ply\nformat binary_little_endian 1\.0\nelement vertex \d+\nproperty (float|double) x\n.*"
     rb"property uchar red\nproperty uchar green\nproperty uchar blue\nproperty int class\n"
 )
+_LAS = rb"LASF.{54}amvnet\0"  # the name of the program
+_CLOUD = "points with labels as predict writes them"
 # The files that are written for a scan, by their ending; nuScenes' label files end in `.bin`.
 SIGNATURES = {
     ".label": Signature("a file of labels", _IDS, unit=4),
     ".bin": Signature("a file of labels", _IDS),
     ".npy": Signature("an array of labels", _ARRAY % b"[<>|][iu]\\d"),
-    ".ply": Signature("points with labels as predict writes them", _PLY),
+    ".ply": Signature(_CLOUD, _PLY),
+    ".pcd": Signature(_CLOUD, re.escape(PCD_HEADER).encode()),
+    ".las": Signature(_CLOUD, _LAS),
+    ".laz": Signature(_CLOUD, _LAS),
 }
 UNCERTAIN = Signature("an array of uncertain points", _ARRAY % rb"\|b1")
 SCORES = Signature("scores of predict", rb"PK\x03\x04.{26}(rv|bev)\.npy")
-PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u2": "ushort", "u1": "uchar"}
 
 
 def check_kind(kind: str) -> None:
-    """Raise InputError if there is no such format for labels; call this before the work."""
+    """Raise InputError if labels cannot be written in a format; call this before the work."""
     if kind not in KINDS:
         raise InputError(
             f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them"
         )
+    check_laspy(f"format {kind}", f".{kind}")
 
 
 def write_scan_labels(
@@ -61,6 +69,8 @@ def write_scan_labels(
     - `npy`: the same ids as an (N,) array.
     - `ply` (binary): x, y, z, red, green, blue, class (raw id), uncertain (0 or 1). Coordinates are
       float32, or float64 if float32 would be off by more than half a millimetre. NaN stays NaN.
+    - `pcd` (binary): the same, with the colours packed in rgb.
+    - `las`, `laz`: the same, as `write_cloud` describes it.
 
     Args:
         stem: the path without an ending; `.` and the kind are added.
@@ -88,12 +98,12 @@ def write_scan_labels(
             return path
 
         columns = _coordinates(xyz)
-        colors = np.asarray(taxonomy.colors, dtype=np.uint8)[ids]
-        columns["red"], columns["green"], columns["blue"] = colors.T
+        colors = np.asarray(class_colors(taxonomy), dtype=np.uint8)[ids]
+        columns |= dict(zip(COLORS, colors.T, strict=True))
         columns["class"] = raw.astype(np.int32)
         if uncertain is not None:
             columns["uncertain"] = np.asarray(uncertain).astype(np.uint8)
-        write_ply(part, columns)
+        write_cloud(part, path.suffix, columns)
     return path
 
 
@@ -112,16 +122,3 @@ def _coordinates(xyz: np.ndarray) -> dict[str, np.ndarray]:
         values = xyz.astype(np.float64)
     x, y, z = values.T
     return {"x": x, "y": y, "z": z}
-
-
-def write_ply(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """Write (N,) columns as the properties of vertices."""
-    fields = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    table = np.rec.fromarrays(list(columns.values()), dtype=fields)
-
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    for name, values in columns.items():
-        type_code = values.dtype.str[1:]  # without the byte order
-        header.append(f"property {PLY_TYPES[type_code]} {name}")
-    header.append("end_header\n")
-    path.write_bytes("\n".join(header).encode("ascii") + table.tobytes())

@@ -16,11 +16,25 @@ function saveFile(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
-/** Return the content of a .label file: the raw ids of a scan's labels, as little-endian uint32. */
-function labelFile(ids, raw) {
-  const view = new DataView(new ArrayBuffer(4 * ids.length));
-  ids.forEach((id, i) => view.setUint32(4 * i, raw[id], true));
-  return view.buffer;
+/**
+ * Return the content of a label file, as bytes: the raw ids of a scan's labels. The ending decides the form: text, an
+ * array of NumPy, bytes (nuScenes' .bin) or little-endian uint32.
+ */
+function labelFile(place, ids, raw) {
+  const ending = place.split(".").at(-1), values = Array.from(ids, (id) => raw[id]);
+  if (["txt", "csv"].includes(ending)) return new TextEncoder().encode(`${values.join("\n")}\n`);
+  if (ending === "bin" && Math.max(...raw) < 256) return Uint8Array.from(values);
+  const head = ending === "npy" ? arrayHeader(values.length) : "", bytes = new Uint8Array(head.length + 4 * values.length);
+  for (let i = 0; i < head.length; i++) bytes[i] = head.charCodeAt(i);
+  const view = new DataView(bytes.buffer, head.length);
+  values.forEach((value, i) => view.setUint32(4 * i, value, true));
+  return bytes;
+}
+
+/** Return the header of an .npy file with an array (count,) of little-endian uint32: 128 characters, each a byte. */
+function arrayHeader(count) {
+  const text = `{'descr': '<u4', 'fortran_order': False, 'shape': (${count},), }`;
+  return `\x93NUMPY\x01\x00\x76\x00${text.padEnd(117)}\n`;
 }
 
 class Editor {
@@ -118,8 +132,9 @@ class Editor {
   }
 
   save() {
-    const { scan } = this.now(), name = `${fileNameOf(scan)}.label`;
-    saveFile(new Blob([labelFile(scan.planes[CORRECTED], about.raw)]), name);
-    byId("edited").textContent = `Saved as ${name}.`;
+    const { scan } = this.now(), place = scan.corrected || `${fileNameOf(scan)}.label`;
+    const name = place.replace(/^[./]+/, "").replace(/[^\w.-]+/g, "-");  // a download has no folders
+    saveFile(new Blob([labelFile(place, scan.planes[CORRECTED], about.raw)]), name);
+    byId("edited").textContent = `Saved as ${name}${name === place ? "" : `; its place is ${place}`}.`;
   }
 }

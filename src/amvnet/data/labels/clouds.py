@@ -1,0 +1,121 @@
+"""Write labelled points as PLY, PCD, LAS or LAZ."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from amvnet.errors import InputError
+
+Columns = dict[str, np.ndarray]
+
+ENDINGS = (".ply", ".pcd", ".las", ".laz")
+COLORS = ("red", "green", "blue")
+PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u2": "ushort", "u1": "uchar"}
+PCD_HEADER = "# .PCD v0.7 - labels of amvnet\nVERSION 0.7"
+LAS_FORMAT = 7  # the point format of LAS 1.4 with colours and classes up to 255
+FULL_COLOR = 257  # colours of LAS have 16 bits: 255 * 257 = 65535
+MILLIMETRE = 0.001
+FARTHEST = 1_000_000.0  # largest coordinate, metres, from which 32 bits of millimetres reach 0
+
+
+def check_laspy(place: object, ending: str) -> None:
+    """Raise InputError if laspy is missing and an ending needs it.
+
+    Args:
+        place: the beginning of the message.
+    """
+    if ending in (".las", ".laz") and find_spec("laspy") is None:
+        raise InputError(
+            f"{place}: expected the package laspy for this format, found none; run pip install "
+            '"amvnet[formats]", or write .ply'
+        )
+
+
+def write_cloud(path: Path, ending: str, columns: Columns, program: str = "amvnet") -> None:
+    """Write points in the format of an ending.
+
+    Args:
+        path: the file.
+        ending: one of `ENDINGS`.
+        columns: (N,) x, y and z in metres; red, green and blue, uint8; class, int32; and any
+            others. LAS has coordinates in millimetres, lost points (NaN) at 0, 0, 0 (in map
+            coordinates, at their lowest corner), and the class as `classification` if all ids are
+            below 256, else as a dimension of its own.
+        program: what LAS says of the program that wrote the file.
+    """
+    if ending == ".ply":
+        _write_ply(path, columns)
+    elif ending == ".pcd":
+        _write_pcd(path, columns)
+    else:
+        _write_las(path, columns, program, packed=ending == ".laz")
+
+
+def _write_ply(path: Path, columns: Columns) -> None:
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns['x'])}"]
+    for name, values in columns.items():
+        header.append(f"property {PLY_TYPES[values.dtype.str[1:]]} {name}")  # without byte order
+    header.append("end_header\n")
+    path.write_bytes("\n".join(header).encode("ascii") + _records(columns))
+
+
+def _write_pcd(path: Path, columns: Columns) -> None:
+    """Write a binary PCD, with the colours packed as PCL packs them."""
+    red, green, blue = (columns[name].astype(np.uint32) for name in COLORS)
+    fields = {}
+    for name, values in columns.items():
+        if name == "red":
+            fields["rgb"] = (red << 16 | green << 8 | blue).view(np.float32)
+        elif name not in COLORS:
+            fields[name] = values
+
+    count = len(columns["x"])
+    header = [
+        PCD_HEADER,
+        f"FIELDS {' '.join(fields)}",
+        f"SIZE {' '.join(str(values.dtype.itemsize) for values in fields.values())}",
+        f"TYPE {' '.join(values.dtype.kind.upper() for values in fields.values())}",
+        f"COUNT {' '.join('1' for _ in fields)}",
+        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n",
+    ]
+    path.write_bytes("\n".join(header).encode("ascii") + _records(fields))
+
+
+def _records(columns: Columns) -> bytes:
+    """Return the bytes of the points, each with the values of all columns side by side."""
+    fields = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
+    return np.rec.fromarrays(list(columns.values()), dtype=fields).tobytes()
+
+
+def _write_las(path: Path, columns: Columns, program: str, packed: bool) -> None:
+    import laspy
+
+    others = dict(columns)
+    xyz = np.stack([others.pop(axis).astype(np.float64) for axis in "xyz"], axis=1)
+    is_placed = np.isfinite(xyz).all(axis=1)
+    is_far = np.abs(xyz[is_placed]).max(initial=0) > FARTHEST
+    colors = [others.pop(name).astype(np.uint16) * FULL_COLOR for name in COLORS]
+    if others["class"].max(initial=0) < 256:
+        classification = others.pop("class")
+    else:
+        classification = np.zeros(len(xyz))
+
+    header = laspy.LasHeader(point_format=LAS_FORMAT, version="1.4")
+    header.generating_software = program
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams(name, values.dtype) for name, values in others.items()]
+    )
+    header.offsets = xyz[is_placed].min(axis=0).round() if is_placed.any() else np.zeros(3)
+    header.scales = np.full(3, MILLIMETRE)
+    cloud = laspy.LasData(header)
+    xyz[~is_placed] = header.offsets if is_far else 0  # integers of 32 bits do not reach 0 from far
+    cloud.x, cloud.y, cloud.z = xyz.T
+    cloud.red, cloud.green, cloud.blue = colors
+    cloud.classification = classification.astype(np.uint8)
+    for name, values in others.items():
+        cloud[name] = values
+    with path.open("wb") as file:
+        cloud.write(file, do_compress=packed, laz_backend=laspy.LazBackend.Lazrs)
