@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import amvnet
-from amvnet.inference.segmentation import Verdict, uncertain_share
+from amvnet.inference.segmentation import Verdict
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 
 from fixtures.commands import run_cli
@@ -118,12 +118,9 @@ def test_one_network_is_trusted_on_real_scans_only(
     assert Verdict.of(method, changed, 0.9).is_doubtful
 
 
-def test_the_share_is_that_of_the_valid_points() -> None:
-    rng = np.random.default_rng(0)
-    labels = rng.integers(0, 3, 100)
-    uncertain = (rng.random(100) < 0.3) & (labels > 0)
-    assert uncertain_share(labels, uncertain) == uncertain[labels > 0].mean()
-    assert uncertain_share(labels[:0], uncertain[:0]) == 0
+def test_points_that_a_map_of_classes_ignores_count_as_others_do() -> None:
+    result = amvnet.load(with_usual(0.1))(POINTS)
+    assert replace(result, labels=np.zeros_like(result.labels)).doubt == result.doubt
 
 
 # ---- the command

@@ -25,7 +25,7 @@ from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.export.onnx import export
-from amvnet.inference.segmentation import Verdict, uncertain_share
+from amvnet.inference.segmentation import Verdict
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import load, save
@@ -239,7 +239,7 @@ def reference(path: Path, weights: str | Path, graphs: Path) -> tuple[np.ndarray
     scan = normaliser(cloud, "scans")
 
     result = OnnxSegmenter(graphs)(scan)
-    verdict = Verdict(uncertain_share(result.labels, result.uncertain), loaded.usual_uncertain)
+    verdict = Verdict(result.uncertain[scan.valid].mean(), loaded.usual_uncertain)
     return loaded.taxonomy.to_raw(result.labels), verdict
 
 

@@ -13,9 +13,9 @@ const LEAST_POINTS = 100;  // the least number of points on which a sensor is me
 const SAME_BEAMS = 1.4;  // the largest ratio of two numbers of lasers that are alike
 
 /**
- * Return {points, rows, places, text, isKnown}. The valid points are normalised (4 n: x, y, z in metres, intensity in
+ * Return {points, rows, places, text, isLike}. The valid points are normalised (4 n: x, y, z in metres, intensity in
  * [0, 1]). With them come their rows in the range image, or null, their places in the cloud, a line on what was assumed,
- * and whether the weights have seen such lasers.
+ * and whether the weights have seen such lasers, or null if they do not say which they have seen.
  *
  * `expected` describes the scans that the weights know: {view, sensor, intensity, as_is}.
  */
@@ -36,8 +36,8 @@ export function normalise(cloud, expected) {
   matchIntensity(moved, expected.intensity);
   const texts = [map.text, missingText(cloud), negativeText(cloud), ...frameTexts(frame)];
   texts.push(heightText(frame, sensor.height), fault, lasersText(lasers));
-  const unknown = sensorText(lasers, sensor), text = `assumed ${texts.filter(Boolean).join(", ")}${unknown}`;
-  return { count, points: moved, rows, places, text, isKnown: !unknown };
+  const isLike = isLikeOf(lasers, sensor), text = `assumed ${texts.filter(Boolean).join(", ")}`;
+  return { count, points: moved, rows, places, text: isLike === false ? text + strangeText(sensor) : text, isLike };
 }
 
 /** Return the points (4 n, float32) at finite coordinates that are not the origin, and their places in the cloud. */
@@ -115,11 +115,15 @@ function lasersText({ beams, fov_up: top, fov_down: bottom }) {
   return `${count} from ${signed(top, 0)} to ${signed(bottom, 0)} degrees`;
 }
 
-/** Return a warning for the end of the line if the weights have not seen such a sensor; else an empty text. */
-function sensorText(lasers, sensor) {
+/** Return whether lasers are like those of a sensor; null if its field of view is not known. */
+function isLikeOf(lasers, sensor) {
+  if (sensor.fov_up === null || sensor.fov_down === null) return null;
   const ratio = lasers.beams && sensor.beams ? lasers.beams / sensor.beams : 1;
-  const isLike = ratio > 1 / SAME_BEAMS && ratio < SAME_BEAMS && hasEndsOf(lasers, sensor);
-  if (sensor.fov_up === null || sensor.fov_down === null || isLike) return "";
+  return ratio > 1 / SAME_BEAMS && ratio < SAME_BEAMS && hasEndsOf(lasers, sensor);
+}
+
+/** Return the end of the line that says which sensor the weights have seen instead. */
+function strangeText(sensor) {
   const name = sensor.name || "a sensor";
   return `; the weights were trained for ${name} (${lasersText(sensor)}) and have seen no such sensor`;
 }

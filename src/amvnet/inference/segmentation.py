@@ -150,7 +150,8 @@ class Segmentation:
         if self.origin is not None and len(self):
             parts.append(f": {self._most_frequent()}")
         if self.verdict is not None:
-            parts.append(f"; {self.verdict.share:.1%} uncertain")
+            what = "uncertain" if self.has_two_networks else "mean entropy"
+            parts.append(f"; {self.verdict.share:.1%} {what}")
             if self.verdict.is_doubtful:
                 parts.append(", not to be relied on")
 
@@ -243,11 +244,13 @@ class Segmentation:
         For a single network, the mean entropy of its probabilities, divided by the largest one.
         """
         network = self.bev if self.rv is None else self.rv
-        if self.has_two_networks or network is None:
-            return uncertain_share(self.labels, self.uncertain)
-        probabilities = network[self.labels > 0].astype(np.float64)
+        is_valid = self.labels > 0 if network is None else network.any(axis=1)
+        count = max(int(np.count_nonzero(is_valid)), 1)
+        if network is None or self.has_two_networks:
+            return int(np.count_nonzero(self.uncertain)) / count
+        probabilities = network.astype(np.float64)
         entropy = -(probabilities * np.log(np.maximum(probabilities, SMALLEST))).sum()
-        return float(entropy / max(len(probabilities), 1) / np.log(max(network.shape[1], 2)))
+        return float(entropy / count / np.log(max(network.shape[1], 2)))
 
     @property
     def assumed(self) -> str:
@@ -299,16 +302,6 @@ class Segmentation:
                 "found a result of the late fusion alone; use its labels"
             )
         return self.origin
-
-
-def uncertain_share(labels: np.ndarray, uncertain: np.ndarray) -> float:
-    """Return the share of a scan's valid points that are uncertain; 0 if there are none.
-
-    Args:
-        labels: (N,) train ids; 0 for points that are not valid.
-        uncertain: (N,) bool.
-    """
-    return int(np.count_nonzero(uncertain)) / max(int(np.count_nonzero(labels)), 1)
 
 
 def fetch(scores: Scores) -> tuple[Tensor, Scores]:
