@@ -244,10 +244,13 @@ def test_the_users_labels_are_not_replaced_by_those_of_other_classes(
 
 def test_a_scan_is_not_replaced_by_its_page(world: Path, tmp_path: Path) -> None:
     scan = shutil.copy(world / "pair/a.bin", tmp_path)
-    command = f"view {scan} {WEIGHTS} --html {scan}".format(world=world)
+    page = tmp_path / "a.html"
+    page.symlink_to(scan)
+    command = f"view {scan} {WEIGHTS} --html {page}".format(world=world)
     for option in ("", " --overwrite"):
         assert "found the input" in refusal(command + option)
-    assert contents(tmp_path) == {"a.bin": (world / "pair/a.bin").read_bytes()}
+    assert page.is_symlink()
+    assert Path(scan).read_bytes() == (world / "pair/a.bin").read_bytes()
 
 
 def test_a_labelled_scan_is_not_replaced_by_labels_from_another_folder(

@@ -280,8 +280,35 @@ def test_what_was_assumed_is_said_once_for_a_source() -> None:
     for word in ("a.pcd", "0 to 255", "m over the ground", "1.73 m", *lasers):
         assert word in lines[0]
 
-    normaliser(make_cloud(points), "other")
+    normaliser(make_cloud(points), "other")  # a recording of the same sensor
+    assert len(lines) == 1
+    points, _ = place(LASERS["vlp16"], 1.9)
+    normaliser(make_cloud(points), "higher")
     assert len(lines) == 2
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        (Sensor(height=0.9), ["0.90 m", "measured is 1.7"]),
+        (KNOWN_SENSORS["os1-64"], ["64 lasers", "rings are 32", "-22.5 degrees"]),
+        (Sensor(fov_up=10, fov_down=-10), ["-10.0 degrees", "points lie"]),
+        (Sensor(height=1.6), []),
+        (KNOWN_SENSORS["vlp32c"], []),
+        (Sensor(), []),
+    ],
+)
+def test_a_sensor_that_is_stated_and_contradicts_the_scan_is_named(
+    stated: Sensor, words: list[str]
+) -> None:
+    lines: list[str] = []
+    normaliser = Normaliser(Expectation.of_sensor("hdl64e"), stated, lines.append)
+    points, ring = place(LASERS["vlp32c"], 1.75)
+    for source in ("drive", "same"):
+        normaliser(make_cloud(points, ring), source)
+    warnings = [line for line in lines if "you state" in line]
+    assert len(warnings) == (1 if words else 0)
+    assert all(word in warnings[0] for word in words)
 
 
 @pytest.mark.parametrize(

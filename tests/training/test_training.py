@@ -137,13 +137,24 @@ def test_a_stage_writes_its_best_and_last_weights_and_its_curves(run: Path, stag
     assert len(column(run, stage, "val/miou")) == (2 if stage == "head" else 3)
 
 
+def test_an_earlier_run_is_refused_before_the_data_are_read(run: Path) -> None:
+    code, error = run_cli(
+        "train", "semantickitti-compact", "--data", run / "missing.yaml", "--out", run
+    )
+    assert code == 2
+    assert "expected no earlier run" in error
+
+
 @STAGES
 def test_the_picture_of_a_run_shows_what_it_logged(run: Path, stage: str) -> None:
     epochs = 2 if stage == "head" else 3
-    curves = read_curves(run / stage, SEMANTICKITTI, epochs)
+    curves = read_curves(run / stage, SEMANTICKITTI)
     assert curves.miou == column(run, stage, "val/miou")
     assert [value for _, value in curves.loss] == column(run, stage, "train/loss")
-    assert 0 < curves.loss[0][0] <= curves.loss[-1][0] <= epochs
+    logged = [epoch for epoch, _ in curves.loss]
+    assert 0 < logged[0] <= 1
+    assert logged == sorted(logged)
+    assert epochs - 1 < logged[-1] <= epochs
     metrics = load(run / stage / "last.safetensors").metrics[PART_OF[stage]]
     assert sum(curves.iou.values()) / 19 == pytest.approx(metrics["val/miou"], abs=1e-5)
     assert (run / "curves.png").read_bytes().startswith(b"\x89PNG")

@@ -21,7 +21,6 @@ from amvnet.models.methods import title_of
 from amvnet.progress import counted
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import built_in, load
-from lidarstreets import LIDAR_MODELS
 
 
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
@@ -196,6 +195,8 @@ def recipes_table() -> Table:
 
 def sensors_table() -> Table:
     """Return the table of the sensors that are known by name."""
+    from lidarstreets import LIDAR_MODELS  # with SciPy, which `predict` does without
+
     table = Table(title="sensors", show_edge=False)
     table.add_column("--sensor")
     for name in ("lasers", "up to", "down to"):

@@ -20,6 +20,7 @@ from amvnet.sensors.lidars import Sensor
 
 MEASURED_SCANS = 5  # number of measured scans in a recording; later scans get their median
 STEADY_HEIGHT = 0.4  # limit of the differences of height in a recording with one frame, metres
+OUTSIDE = 2.0  # smallest excess of points over a field of view that contradicts it, degrees
 # Step between the points that are measured first. 7 divides no usual number of lasers.
 QUICK_STEP = 7
 
@@ -48,6 +49,34 @@ class Estimate:
         """
         is_of_one_range = are_of_one_range(self.quantiles, other.quantiles)
         return is_of_one_range and self.lasers.is_like(other.lasers)
+
+    def is_near(self, other: Estimate) -> bool:
+        """Return whether two estimates show one sensor in one frame, about equally high."""
+        return self.is_like(other) and _are_steady([self.frame, other.frame])
+
+    def contradiction(self, sensor: Sensor) -> str:
+        """Return in words what is stated about a sensor and contradicts this estimate, or ""."""
+        texts = []
+        height = None if self.frame.is_on_ground(sensor) else self.frame.height
+        known = height if sensor.height is None else sensor.height
+        if height is not None and known is not None and abs(height - known) > STEADY_HEIGHT:
+            texts.append(f"a height of {known:.2f} m, measured is {height:.2f}")
+
+        beams = self.lasers.beams
+        if not SensorGeometry(beams).is_like(SensorGeometry(sensor.beams)):
+            texts.append(f"{sensor.beams} lasers, the rings are {beams}")
+        if self.frame.pitch or self.frame.roll:  # elevations of a levelled scan
+            return "; ".join(texts)
+        # The highest lasers may see only the sky, but nothing lies outside the field of view.
+        for end, seen, sign in (
+            (sensor.fov_up, self.lasers.fov_up, 1),
+            (sensor.fov_down, self.lasers.fov_down, -1),
+        ):
+            if end is not None and seen is not None and sign * (seen - end) > OUTSIDE:
+                texts.append(
+                    f"an end of the lasers at {end:+.1f} degrees, points lie at {seen:+.1f}"
+                )
+        return "; ".join(texts)
 
 
 class Recording:

@@ -111,8 +111,9 @@ class Normaliser:
         expected: the scans that the weights expect. If it is None, scans are only turned by the
             description of the sensor, so that people can look at them.
         sensor: what is known about the scans' sensor; the rest is measured.
-        report: called with one line on what was assumed, once for each recording, and once more if
-            the recording has scans from other sensors.
+        report: called with one line on what was assumed, once for all recordings of one sensor, and
+            once more if a recording has scans from other sensors; and with a line on what is known
+            about the sensor and contradicts the scans.
     """
 
     def __init__(
@@ -127,6 +128,7 @@ class Normaliser:
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
         self._reported: set[str] = set()  # recordings whose line was already reported
+        self._described: list[tuple[str, Estimate]] = []  # notes and estimates in these lines
 
     def quiet(self) -> None:
         """Report nothing more."""
@@ -164,8 +166,20 @@ class Normaliser:
                 line += f"; {source} has scans of other sensors, so that each is measured alone"
             if not is_usual:
                 line += f"; another sensor or scale of intensity than {source} begins with"
-            self._report(line)
+            if not is_usual or recording.is_mixed or not self._is_described(cloud, estimate):
+                self._report(line)
+                stated = estimate.contradiction(self.sensor)
+                if stated:
+                    self._report(f"warning: {cloud.name}: you state {stated}; correct the sensor")
         return scan
+
+    def _is_described(self, cloud: Cloud, estimate: Estimate) -> bool:
+        """Return whether an earlier line describes a recording; else, remember that one does."""
+        for note, other in self._described:
+            if note == cloud.note and estimate.is_near(other):
+                return True
+        self._described.append((cloud.note, estimate))
+        return False
 
     def measure(self, source: str) -> Recording:
         """Return the recording of a source. The first call measures its announced scans."""

@@ -16,6 +16,7 @@ MAX_MARKED = 30  # only curves with fewer points have markers
 
 # Names of the metrics in TensorBoard's files.
 LOSS = "train/loss"
+EPOCHS = "train/epochs"  # the number of epochs that are done, with the loss
 MIOU = "val/miou"
 CLASS_IOU = "iou/"  # followed by the name of the class
 
@@ -36,13 +37,12 @@ class Curves:
     iou: Mapping[str, float]
 
 
-def read_curves(folder: Path, taxonomy: Taxonomy, epochs: int) -> Curves:
+def read_curves(folder: Path, taxonomy: Taxonomy) -> Curves:
     """Read the curves of a stage from its TensorBoard files.
 
     Args:
         folder: the folder of the stage. If its files lack a metric, the curve is empty.
         taxonomy: the classes.
-        epochs: number of epochs of the stage.
     """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -54,16 +54,15 @@ def read_curves(folder: Path, taxonomy: Taxonomy, epochs: int) -> Curves:
         # A resumed run repeats the steps after its checkpoint. The last value counts.
         return {event.step: event.value for event in events.Scalars(name)} if name in names else {}
 
-    loss = sorted(by_step(LOSS).items())
-    miou = [value for _, value in sorted(by_step(MIOU).items())]
-    validated = by_step(MIOU)
-    steps = max([*validated, *(step for step, _ in loss)], default=0) + 1
+    losses, epochs, validated = by_step(LOSS), by_step(EPOCHS), by_step(MIOU)
+    loss = [(epochs[step], losses[step]) for step in sorted(losses.keys() & epochs.keys())]
+    miou = [validated[step] for step in sorted(validated)]
     iou = {}
     for name in taxonomy.classes:
         values = by_step(f"{CLASS_IOU}{name}")
         if values and max(values) == max(validated, default=-1):
             iou[name] = values[max(values)]
-    return Curves([((step + 1) / steps * epochs, value) for step, value in loss], miou, iou)
+    return Curves(loss, miou, iou)
 
 
 def draw_curves(stages: Mapping[str, Curves], path: Path) -> Path:

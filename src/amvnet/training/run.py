@@ -67,8 +67,7 @@ def _draw_curves(plan: Plan) -> None:
     stages = {}
     for name in PART_OF:
         if is_finished(plan, name):
-            epochs = getattr(plan.recipe.training, name).epochs
-            stages[name] = read_curves(plan.out / name, plan.data.taxonomy, epochs)
+            stages[name] = read_curves(plan.out / name, plan.data.taxonomy)
     if stages:
         path = draw_curves(stages, plan.out / CURVES)
         plan.report(f"loss, mIoU by epoch and IoU by class: {path}")

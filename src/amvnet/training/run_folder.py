@@ -219,6 +219,19 @@ def stage_record(plan: Plan, settings: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def check_new(folder: Path) -> None:
+    """Raise InputError if a stage was begun in a folder before."""
+    if _is_begun(folder):
+        raise InputError(
+            f"{folder}: expected no earlier run, found one; add --resume or give another folder"
+        )
+
+
+def _is_begun(folder: Path) -> bool:
+    # A finished stage does not need its checkpoint, so the file may be gone.
+    return any((folder / name).is_file() for name in (LAST, DONE))
+
+
 def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     """Check that a stage can begin in a folder, or be resumed there.
 
@@ -226,13 +239,10 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         InputError: if the stage was begun before, and either is not to be resumed or had other
             settings.
     """
-    # A finished stage does not need its checkpoint, so the file may be gone.
-    if not any((folder / name).is_file() for name in (LAST, DONE)):
-        return
     if not resume:
-        raise InputError(
-            f"{folder}: expected no earlier run, found one; add --resume or give another folder"
-        )
+        check_new(folder)
+    if not _is_begun(folder):
+        return
 
     begun = _entries(folder / SETTINGS)
     for key in ("init", "classes"):  # which runs of version 0.3 do not have

@@ -40,6 +40,7 @@ from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes, device_of, environment
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
+from amvnet.training.curves import EPOCHS
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import LAST, is_finished
 from amvnet.training.sync_batch_norm import synchronise_batch_norms
@@ -114,6 +115,10 @@ class Stage(L.LightningModule):
         """
         total: NDArray[np.float64] = np.sum(self.processes.gather(self.matrix), axis=0)
         return total
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Log the number of epochs that are done, which places the loss in a diagram."""
+        self.log(EPOCHS, self.current_epoch + (batch_idx + 1) / self.trainer.num_training_batches)
 
     def on_validation_epoch_start(self) -> None:
         self.matrix = self.empty_matrix()

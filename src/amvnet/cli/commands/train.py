@@ -54,8 +54,12 @@ def train(
     from amvnet.runtime.distributed import device_of
     from amvnet.training.plan import Plan
     from amvnet.training.run import train as train_stages
+    from amvnet.training.run_folder import check_new
     from amvnet.weights.file import load
 
+    if not resume:
+        for name in recipe.stages if stage == "all" else (stage,):
+            check_new(out / name)  # before the scans are measured
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     plan = Plan.open(
         recipe,
