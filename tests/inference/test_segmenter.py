@@ -121,10 +121,9 @@ def with_lost_returns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         [np.nan, 1, 1, 0.5],
         [1, np.inf, 1, 0.5],
         [1, 1, -np.inf, 0.5],
-        [1, 1, 1, np.nan],
         [np.nan, np.nan, np.nan, np.nan],
     ]
-    indices = np.array([0, 7, 7, 100, len(points)])
+    indices = np.array([0, 7, 7, len(points)])
     is_lost = np.insert(np.zeros(len(points), bool), indices, True)
     return np.insert(points, indices, np.array(rows, np.float32), axis=0), is_lost
 

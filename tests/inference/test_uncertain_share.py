@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import amvnet
+from amvnet.inference.predict import ADVICE
 from amvnet.inference.segmentation import Verdict
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 
@@ -145,7 +146,7 @@ def test_predict_says_the_share_of_the_run(
 
     text = said(world, tmp_path, weights, capsys, "--at-once", at_once)
     assert str(verdict) in text
-    assert "warning" not in text
+    assert ADVICE not in text
 
 
 def test_predict_warns_and_says_what_to_try(
