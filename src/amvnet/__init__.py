@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 from amvnet.progress import Reporter, report_nothing
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from amvnet import onnx_runner as onnx_runner
@@ -88,6 +89,9 @@ def load(
     engine: EngineName = "torch",
     tau: float | None = None,
     *,
+    sensor: str | Mapping[str, Any] | None = None,
+    height: float | None = None,
+    columns: str | Sequence[str] | None = None,
     graphs: bool = True,
     report: Reporter = report_nothing,
 ) -> Segmenter:
@@ -112,19 +116,32 @@ def load(
         engine: the program that runs the networks: "torch", "onnx" or "int8".
         tau: a point is uncertain if the cosine similarity of the two networks' class probabilities
             is at most tau, in [0, 1]. By default, it is the threshold of the weights.
+        sensor: the sensor of arrays and scan files: a name that `amvnet list` prints, a YAML file,
+            or attributes such as {"unit": "mm", "axes": "z-down"}. The rest is measured. With a
+            sensor or a height, arrays are normalised as files are.
+        height: the height of the sensor over the ground, metres.
+        columns: the names of the columns of arrays and of files of rows, as `Segmenter` takes them.
         graphs: on a GPU, capture the networks as CUDA graphs.
         report: called with a line that names the device, and with a line before long work.
 
     Raises:
-        InputError: if there are no such weights; if they lack a part that the method needs; if
-            there is no such method, device, precision or engine; if tau is out of range; if a
-            library of the engine is missing; or if the sensor of the weights cannot be simulated
-            for int8.
+        InputError: if there are no such weights, sensor or columns; if the weights lack a part that
+            the method needs; if there is no such method, device, precision or engine; if tau is out
+            of range; if a library of the engine is missing; or if the sensor of the weights cannot
+            be simulated for int8.
     """
+    from amvnet.data.formats.rows import parse_layout
     from amvnet.engines.compute import Compute
+    from amvnet.sensors.lidars import make_sensor
 
+    is_described = sensor is not None or height is not None
+    described = make_sensor(sensor, height=height) if is_described else None
+    parse_layout(columns)  # before the networks are loaded, which takes long
     compute = Compute(device, engine, precision)
-    return load_with(compute, weights, method, tau, graphs=graphs, report=report)
+    segmenter = load_with(compute, weights, method, tau, graphs=graphs, report=report)
+    segmenter.sensor = described
+    segmenter.columns = columns
+    return segmenter
 
 
 def load_with(

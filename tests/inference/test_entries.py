@@ -35,7 +35,7 @@ from amvnet.models.amvnet import LateFusion
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.onnx_runner import OnnxSegmenter
-from amvnet.scan import Scan
+from amvnet.scan import Scan, turned
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.lidars import Sensor
@@ -533,6 +533,54 @@ def test_rings_that_are_not_in_order_are_said(
     result = by_laser.segmenter(by_laser.write(points))
     assert result.origin is not None
     assert ", rings " in result.origin.assumed
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("cm", 100.0), ("ft", 1 / 0.3048)])
+def test_arrays_in_other_units_are_refused_or_normalised_by_the_sensor(
+    by_laser: World, unit: str, factor: float
+) -> None:
+    points = in_order()
+    scaled = points * np.array([factor, factor, factor, 1])
+    for entry in (by_list, by_fields, by_many):
+        fails(partial(entry, by_laser, scaled), "expected", "give metres", unit)
+
+    expected = by_path(by_laser, points)
+    described = amvnet.load(by_laser.weights, sensor={"unit": unit})
+    for given in (scaled, by_laser.write(scaled)):
+        result = described(given)
+        assert (result.labels == expected).mean() > 0.995
+        assert result.origin is not None
+        assert "over the ground" in result.origin.assumed
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"offset": (0.5, -0.25, 1.0)},
+        {"axes": "y-forward"},
+        {"axes": "z-down", "offset": (2.0, 0.0, -1.0)},
+        {"rotate": (90.0, 0.0, 0.0)},
+        {"rotate": (0.0, 9.0, 0.0), "offset": (0.0, 0.0, 0.5)},
+    ],
+)
+def test_a_scan_that_is_moved_and_moved_back_keeps_the_rows_of_its_lasers(
+    by_laser: World, how: dict[str, Any]
+) -> None:
+    points = turned(Scan(in_order()), 0.003).points  # so that no point is on the axis
+    expected = by_laser.segmenter(by_laser.write(points))
+    sensor = Sensor(**how)
+    moved = points.astype(np.float64)
+    moved[:, :3] = (moved[:, :3] - np.array(sensor.offset or (0, 0, 0))) @ sensor.turn
+
+    described = amvnet.load(by_laser.weights, sensor=how)
+    for given in (moved, by_laser.write(moved)):
+        result = described(given)
+        assert result.origin is not None
+        assert expected.origin is not None
+        row = expected.origin.scan.row
+        assert row is not None
+        np.testing.assert_array_equal(result.origin.scan.row, row)
+        assert (result.labels == expected.labels).mean() > 0.995
 
 
 OF_8_BITS = ("intensities in [0, 1]", "to 255", "divide")

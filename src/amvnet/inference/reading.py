@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.formats.cloud import require_columns
+from amvnet.data.formats.cloud import Cloud, require_columns
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
+from amvnet.sensors.frame import check_metres
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler
 from amvnet.sensors.lidars import Sensor, make_sensor
 from amvnet.sensors.normalise import Normaliser
@@ -36,6 +37,23 @@ def checked_scan(
     return check_scan(scan)
 
 
+def array_cloud(points: AnyArray, columns: str | Sequence[str] | None = None) -> Cloud:
+    """Return the points of an array as those of a file; `array_scan` documents the arguments."""
+    names = parse_layout(columns).columns
+    with errors_of("scan"):
+        array = as_array(points, EXPECTED)
+    if array.dtype.names is not None:
+        fields = array.ravel()
+        values = [fields[name] for name in array.dtype.names]
+        names = names or array.dtype.names
+        require_columns(names, "scan")
+    else:
+        _check_shape(array)
+        values = list(array.T)
+        names = names or name_columns(array)
+    return named_cloud(values, names, "scan")
+
+
 def array_scan(
     points: AnyArray,
     columns: str | Sequence[str] | None = None,
@@ -53,22 +71,12 @@ def array_scan(
         trained: fills in intensities with a warning if there are none; without it, they are 0.
 
     Raises:
-        InputError: if the shape is another one, or names of columns are missing.
+        InputError: if the shape is another one, names of columns are missing, or the coordinates
+            are clearly not metres.
     """
-    names = parse_layout(columns).columns
+    cloud = array_cloud(points, columns)
     with errors_of("scan"):
-        array = as_array(points, EXPECTED)
-    if array.dtype.names is not None:
-        fields = array.ravel()
-        values = [fields[name] for name in array.dtype.names]
-        names = names or array.dtype.names
-        require_columns(names, "scan")
-    else:
-        _check_shape(array)
-        values = list(array.T)
-        names = names or name_columns(array)
-
-    cloud = named_cloud(values, names, "scan")
+        check_metres(cloud.xyz[cloud.is_placed])
     count = len(cloud.xyz)
     intensity = cloud.intensity
     # If no intensity is a number, there are none, as in files.
@@ -76,7 +84,7 @@ def array_scan(
         intensity = np.zeros(count) if trained is None else trained.filler(count)
         warnings.warn(
             f"the scan has no intensity: {describe_filler(trained)}; give a fourth column",
-            stacklevel=4,
+            stacklevel=5,
         )
 
     table = np.empty((count, 4), np.float32)

@@ -106,7 +106,7 @@ class Origin:
             None if it is not known for this tau.
         path: the file of the scan; None if the scan was in memory.
         file_xyz: (N, 3) the unchanged coordinates of the file; None if the scan was in memory.
-        assumed: what was assumed of the scan's sensor; empty if the scan was in memory.
+        assumed: what was assumed of the scan's sensor; empty if the scan was not normalised.
     """
 
     scan: Scan

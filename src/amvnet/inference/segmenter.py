@@ -14,13 +14,14 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
 from amvnet.inference.listing import FileReader, InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import checked_scan
+from amvnet.inference.reading import array_cloud, checked_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.memory import return_freed_memory
 from amvnet.scan import AnyArray, Scan, turned
+from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
 
@@ -40,12 +41,17 @@ class Segmenter:
 
     Attributes:
         weights, engine, at_once: as above.
+        sensor: what is known about the sensor of arrays and files. If it is None, files are
+            normalised by what they show, and arrays are taken as they are.
+        columns: the names of the columns of arrays and files, as `__call__` takes them.
     """
 
     def __init__(self, weights: Weights, engine: Engine, at_once: int | None = None) -> None:
         self.weights = weights
         self.engine = engine
         self.at_once = engine.at_once if at_once is None else at_once
+        self.sensor: Sensor | None = None
+        self.columns: str | Sequence[str] | None = None
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -90,6 +96,7 @@ class Segmenter:
         Args:
             points: one of
                 - (N, 4) x, y, z in metres and intensity in [0, 1], as an array, a tensor or a list;
+                  if the segmenter knows the sensor, in the sensor's units, and normalised as files;
                 - an array with other columns or with named fields (`array_scan`);
                 - a `Scan`;
                 - the path of a scan file. The scan is normalised to the weights, as `amvnet
@@ -111,8 +118,8 @@ class Segmenter:
                 "leave them out"
             )
         if not isinstance(points, Path | str):
-            scan = checked_scan(points, columns, self.weights.expects.intensity)
-            return self._segment([scan], [yaw])[0]
+            scan, line = self._read_array(points, columns)
+            return self._segment([scan], [yaw], [line])[0]
 
         if is_dataset(str(points)):
             raise InputError(
@@ -120,7 +127,7 @@ class Segmenter:
                 "Segmenter.each"
             )
         normaliser, assumed = self._normaliser()
-        named = list_scans(points, layout=parse_layout(columns))
+        named = list_scans(points, layout=parse_layout(columns or self.columns))
         scans = FileReader(normaliser).scans(named, self.taxonomy)
         if len(scans) > 1:
             raise InputError(
@@ -141,23 +148,37 @@ class Segmenter:
             InputError: if a scan cannot be segmented; segment them one by one to see which.
         """
         checked = []
-        for scan in scans:
-            checked.append(checked_scan(scan, trained=self.weights.expects.intensity))
-        return self._segment(checked, yaws)
+        lines = []
+        for points in scans:
+            scan, line = self._read_array(points)
+            checked.append(scan)
+            lines.append(line)
+        return self._segment(checked, yaws, lines)
+
+    def _read_array(
+        self, points: AnyArray | Scan, columns: str | Sequence[str] | None = None
+    ) -> tuple[Scan, str]:
+        """Return the scan of an array, and what was assumed of its sensor if it is described."""
+        columns = columns or self.columns
+        if self.sensor is None or isinstance(points, Scan):
+            return checked_scan(points, columns, self.weights.expects.intensity), ""
+        normaliser, assumed = self._normaliser()
+        scan = normaliser(array_cloud(points, columns), "scan")
+        return scan, assumed[0]
 
     def _segment(
-        self, scans: Sequence[Scan], yaws: Sequence[float] | None = None
+        self, scans: Sequence[Scan], yaws: Sequence[float] | None, assumed: Sequence[str]
     ) -> list[Segmentation]:
-        """Segment scans in one pass; each has a valid point."""
+        """Segment scans, each with a valid point and what was assumed of it, in one pass."""
         is_large = sum(map(len, scans)) >= LARGE_BATCH
         with return_freed_memory() if is_large else nullcontext():
             batch = self.batch(scans, yaws)
             labels, scores = fetch(self.engine.score(batch))
 
         results = []
-        for scan, points in zip(scans, batch.slices(), strict=True):
+        for scan, points, line in zip(scans, batch.slices(), assumed, strict=True):
             result = unpack(scan.valid, labels, scores, points)
-            origin = Origin(scan, self.taxonomy, self.method, self.usual_uncertain)
+            origin = Origin(scan, self.taxonomy, self.method, self.usual_uncertain, assumed=line)
             results.append(replace(result, origin=origin))
         return results
 
@@ -179,14 +200,14 @@ class Segmenter:
                 segmented.
         """
         normaliser, assumed = self._normaliser()
-        options = ScanOptions(topic=topic)
+        options = ScanOptions(topic=topic, layout=parse_layout(self.columns))
         scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
         return (self._segment_input(scan, assumed) for scan in scans)
 
     def _normaliser(self) -> tuple[Normaliser, list[str]]:
         """Return a normaliser, and the list of what it assumes of the sensors of the scans."""
         assumed: list[str] = []
-        return Normaliser(self.weights.expects, report=assumed.append), assumed
+        return Normaliser(self.weights.expects, self.sensor, assumed.append), assumed
 
     def _segment_input(self, scan: InputScan, assumed: list[str], yaw: float = 0.0) -> Segmentation:
         """Read and segment one of the scans for which a normaliser has `assumed` something."""

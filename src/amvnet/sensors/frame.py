@@ -18,6 +18,8 @@ MAX_METRES_MEDIAN = 200.0  # largest median distance of coordinates in metres
 # Smallest median distance of coordinates that must be millimetres. A median between the two limits
 # may be in centimetres or millimetres.
 MIN_MILLIMETRES_MEDIAN = 4000.0
+MAX_SENSOR_HEIGHT = 4.5  # largest height of a sensor on a vehicle, metres; more may be feet
+QUICK_STEP = 7  # step between the points that are measured first; it divides no number of lasers
 # Largest ratio of the 5 % quantile of the distances to the 95 % quantile with which the origin is
 # near the sensor.
 AROUND_SHARE = 0.5
@@ -111,7 +113,7 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
         InputError: if the user did not give the unit, and the coordinates are clearly neither
             metres nor millimetres.
     """
-    unit = sensor.unit or _find_unit(xyz)
+    unit = sensor.unit or _find_unit(xyz, "give --unit cm or mm (or m, if they are metres)")
     frame = Frame(unit, sensor.axes or "x-forward")
     level = frame.complete(dataclasses.replace(sensor, unit=unit)).to_level(xyz)
     level = level.astype(np.float64)
@@ -133,11 +135,35 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
     return dataclasses.replace(frame, height=ground.height, tilt=ground.tilt)
 
 
-def _find_unit(xyz: np.ndarray) -> str:
+def check_metres(xyz: np.ndarray) -> None:
+    """Check that the points (N, 3) of an array, none of them lost, are in metres.
+
+    Raises:
+        InputError: if the points of a file would be taken for other units, or refused.
+    """
+    advice = (
+        "give metres, or to amvnet.load sensor={'unit': UNIT} with mm, cm, ft or m, or the height"
+    )
+    part = xyz[::QUICK_STEP]
+    if _find_unit(part, advice) != "m":
+        raise InputError(f"expected metres from the sensor, found millimetres; {advice}")
+
+    # Only then may the ground be so deep, which takes longer to find.
+    if len(part) and np.quantile(part[:, 2], 0.1) < -MAX_SENSOR_HEIGHT:
+        ground = find_ground(xyz.astype(np.float64))
+        if ground is not None and ground.height > MAX_SENSOR_HEIGHT:
+            raise InputError(
+                f"expected a sensor at most {MAX_SENSOR_HEIGHT:g} m over the ground, found "
+                f"{ground.height:.1f}; {advice}"
+            )
+
+
+def _find_unit(xyz: np.ndarray, advice: str) -> str:
     """Return the unit, "m" or "mm", by the distances of points (N, 3).
 
     Raises:
-        InputError: if the distances are clearly neither metres nor millimetres.
+        InputError: if the distances are clearly neither metres nor millimetres; it ends in the
+            advice.
     """
     if not len(xyz):
         return "m"
@@ -151,7 +177,7 @@ def _find_unit(xyz: np.ndarray) -> str:
         return "mm"
     raise InputError(
         f"expected metres from the sensor, found half of the points farther than {median:.0f}; "
-        "give --unit cm or mm (or m, if they are metres)"
+        f"{advice}"
     )
 
 

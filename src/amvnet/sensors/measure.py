@@ -13,7 +13,7 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.data.laser_order import order_rings
 from amvnet.errors import InputError, errors_of
 from amvnet.scan import Scan
-from amvnet.sensors.frame import STEADY_TILT, Frame, find_frame, median_frame
+from amvnet.sensors.frame import QUICK_STEP, STEADY_TILT, Frame, find_frame, median_frame
 from amvnet.sensors.intensity import are_of_one_range, quantiles_of
 from amvnet.sensors.lasers import SensorGeometry, measure_lasers
 from amvnet.sensors.lidars import Sensor
@@ -21,8 +21,6 @@ from amvnet.sensors.lidars import Sensor
 MEASURED_SCANS = 5  # number of measured scans in a recording; later scans get their median
 STEADY_HEIGHT = 0.4  # limit of the differences of height in a recording with one frame, metres
 OUTSIDE = 2.0  # smallest excess of points over a field of view that contradicts it, degrees
-# Step between the points that are measured first. 7 divides no usual number of lasers.
-QUICK_STEP = 7
 
 
 @dataclass(frozen=True)

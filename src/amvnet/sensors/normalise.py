@@ -16,7 +16,7 @@ from amvnet.models.views.range_view import RangeView
 from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
-from amvnet.sensors.frame import Frame
+from amvnet.sensors.frame import MAX_SENSOR_HEIGHT, Frame
 from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
 from amvnet.sensors.lasers import SensorGeometry, elevations
 from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, Sensor, rotation_from_degrees
@@ -29,8 +29,6 @@ from amvnet.sensors.measure import (
     seen_scan,
 )
 
-# Largest height of a sensor on a vehicle, metres. A larger height may be in feet.
-MAX_SENSOR_HEIGHT = 4.5
 MAX_OUTSIDE_SHARE = 0.16  # limit of the share of the points outside a field of view that suffices
 
 
