@@ -104,9 +104,8 @@ class Scan:
         if np.abs(self.points).max(initial=0) < FARTHEST:
             valid = np.ones(len(self.points), dtype=bool)
         else:
-            # A reduction over rows of four would take ten times as long as these columns.
-            x, y, z = np.abs(self.points.T[:3])
-            valid = (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST)
+            # Contiguous columns: a reduction over rows of four takes ten times as long.
+            valid = (np.abs(self.points.T[:3], order="C") < FARTHEST).all(axis=0)
 
         valid[at_origin(self.points)] = False
         return valid

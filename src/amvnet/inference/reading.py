@@ -76,7 +76,7 @@ def array_scan(
     """
     cloud = array_cloud(points, columns)
     with errors_of("scan"):
-        check_metres(cloud.xyz[cloud.is_placed])
+        check_metres(cloud)
     count = len(cloud.xyz)
     intensity = cloud.intensity
     # If no intensity is a number, there are none, as in files.

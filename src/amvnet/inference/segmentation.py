@@ -244,7 +244,7 @@ class Segmentation:
         For a single network, the mean entropy of its probabilities, divided by the largest one.
         """
         network = self.bev if self.rv is None else self.rv
-        is_valid = self.labels > 0 if network is None else network.any(axis=1)
+        is_valid = self.labels > 0 if self.origin is None else self.origin.scan.valid
         count = max(int(np.count_nonzero(is_valid)), 1)
         if network is None or self.has_two_networks:
             return int(np.count_nonzero(self.uncertain)) / count

@@ -9,6 +9,7 @@ from statistics import mode
 
 import numpy as np
 
+from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
 from amvnet.sensors.ground import Ground, find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
@@ -135,8 +136,8 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
     return dataclasses.replace(frame, height=ground.height, tilt=ground.tilt)
 
 
-def check_metres(xyz: np.ndarray) -> None:
-    """Check that the points (N, 3) of an array, none of them lost, are in metres.
+def check_metres(cloud: Cloud) -> None:
+    """Check that the points of an array are in metres.
 
     Raises:
         InputError: if the points of a file would be taken for other units, or refused.
@@ -144,13 +145,14 @@ def check_metres(xyz: np.ndarray) -> None:
     advice = (
         "give metres, or to amvnet.load sensor={'unit': UNIT} with mm, cm, ft or m, or the height"
     )
-    part = xyz[::QUICK_STEP]
+    placed = np.flatnonzero(cloud.is_placed)
+    part = cloud.xyz[placed[::QUICK_STEP]]
     if _find_unit(part, advice) != "m":
         raise InputError(f"expected metres from the sensor, found millimetres; {advice}")
 
     # Only then may the ground be so deep, which takes longer to find.
     if len(part) and np.quantile(part[:, 2], 0.1) < -MAX_SENSOR_HEIGHT:
-        ground = find_ground(xyz.astype(np.float64))
+        ground = find_ground(cloud.xyz[placed].astype(np.float64))
         if ground is not None and ground.height > MAX_SENSOR_HEIGHT:
             raise InputError(
                 f"expected a sensor at most {MAX_SENSOR_HEIGHT:g} m over the ground, found "

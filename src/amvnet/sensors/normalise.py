@@ -56,12 +56,10 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     to_sensor, to_trained = estimate.frame.rises(sensor, height)
     moved = raise_points(seen, to_trained - to_sensor)
 
-    valid = seen.valid
     lasers = estimate.lasers.override(sensor)
-    view = _row_view(seen.points[valid], lasers, expected)
     row = _rows_by_laser(seen, estimate.frame.complete(sensor), lasers, expected)
     if row is None:
-        row = _rows(seen, valid, view, expected)
+        row = _rows(seen, lasers, expected)
     return dataclasses.replace(moved, row=row)
 
 
@@ -307,9 +305,7 @@ def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) 
     return dataclasses.replace(view, rows="elevation", fov_up=top + half, fov_down=bottom - half)
 
 
-def _rows(
-    scan: Scan, valid: np.ndarray, view: RangeViewConfig | None, expected: Expectation
-) -> np.ndarray | None:
+def _rows(scan: Scan, lasers: SensorGeometry, expected: Expectation) -> np.ndarray | None:
     """Return the row of each point by elevation: (N,), 0 is the top, -1 is a lost point.
 
     If the weights' rows are rings and the scan's rings suit them, the rings decide. Return None if
@@ -318,9 +314,12 @@ def _rows(
     by_ring = None
     if expected.view.rows == "ring" and scan.ring is not None:
         by_ring = _rows_of_rings(scan.ring, expected.view)
-    # If no data sheet describes the lasers, they may be unevenly spaced.
-    is_trusted = by_ring is not None and not expected.sensor.name
-    if view is None or is_trusted:
+        # If no data sheet describes the lasers, they may be unevenly spaced.
+        if not expected.sensor.name:
+            return by_ring
+    valid = scan.valid
+    view = _row_view(scan.points[valid], lasers, expected)
+    if view is None:
         return by_ring
 
     rows = np.full(len(scan), -1)

@@ -65,9 +65,8 @@ class Cloud:
     @property
     def is_placed(self) -> np.ndarray:
         """(N,) bool: whether a point has finite coordinates that are not 0, 0, 0."""
-        # Each column is checked alone: a reduction over rows of three takes ten times as long.
-        x, y, z = np.isfinite(self.xyz.T)
-        placed: np.ndarray = x & y & z
+        # Contiguous columns: a reduction over rows of three takes ten times as long.
+        placed: np.ndarray = np.isfinite(self.xyz.T, order="C").all(axis=0)
         placed[at_origin(self.xyz)] = False
         return placed
 
