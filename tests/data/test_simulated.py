@@ -20,9 +20,9 @@ from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.datasets.select import to_train
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.datasets.training_data import Source, TrainingData
-from amvnet.data.laser_order import lasers_by_order
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.laser_order import lasers_by_order
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, drive_street, simulate, writing
 

@@ -21,7 +21,6 @@ from amvnet import onnx_runner
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData
-from amvnet.data.laser_order import lasers_by_order
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.evaluation.scoring import label_by_weights
@@ -38,6 +37,7 @@ from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan, turned
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
+from amvnet.sensors.laser_order import lasers_by_order
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
 from amvnet.training.loaders import ScanSet, collate

@@ -11,7 +11,6 @@ from typing import Any
 from amvnet.config.bounds import check_text
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import RangeViewConfig
-from amvnet.data.laser_order import lasers_by_order, order_rings
 from amvnet.errors import InputError, shown
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import (
@@ -21,6 +20,7 @@ from amvnet.sensors.intensity import (
     fill_intensity,
     match_scan,
 )
+from amvnet.sensors.laser_order import lasers_by_order, order_rings
 from amvnet.sensors.lasers import MEASURES, SensorGeometry
 from amvnet.sensors.lidars import KNOWN_HEIGHTS, KNOWN_SENSORS, Sensor
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.laser_order import order_rings
 from amvnet.errors import InputError, errors_of
 from amvnet.scan import Scan
 from amvnet.sensors.frame import QUICK_STEP, STEADY_TILT, Frame, find_frame, median_frame
 from amvnet.sensors.intensity import are_of_one_range, quantiles_of
+from amvnet.sensors.laser_order import order_rings
 from amvnet.sensors.lasers import SensorGeometry, measure_lasers
 from amvnet.sensors.lidars import Sensor
 

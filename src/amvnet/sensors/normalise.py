@@ -9,7 +9,6 @@ import numpy as np
 
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.formats.cloud import Cloud, usual_scale
-from amvnet.data.laser_order import lasers_by_order
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
@@ -18,6 +17,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.frame import MAX_SENSOR_HEIGHT, Frame
 from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
+from amvnet.sensors.laser_order import lasers_by_order
 from amvnet.sensors.lasers import SensorGeometry, elevations
 from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, Sensor, rotation_from_degrees
 from amvnet.sensors.measure import (

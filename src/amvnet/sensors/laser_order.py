@@ -8,6 +8,8 @@ import numpy as np
 
 from amvnet.data.formats.cloud import MAX_RINGS
 from amvnet.scan import Scan
+from amvnet.sensors.ground import MIN_DISTANCE
+from amvnet.sensors.lasers import elevations
 
 # The largest mean deviation of the slopes z / hypot(x, y) of one laser; about 2 degrees.
 SLOPE_SPREAD = 0.035
@@ -18,7 +20,6 @@ MIN_POINTS = 64  # the least mean number of points of a laser; fewer do not show
 MAX_RING_SPREAD = 0.2
 MIN_RING_POINTS = 10  # the least number of points of a ring whose elevation counts
 SAME_ELEVATION = 0.1  # rings that descend by less than this are in order, degrees
-MIN_DISTANCE = 1.0  # smallest distance of points that count, metres: nearer ones are lost returns
 
 
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
@@ -116,12 +117,10 @@ def _elevations_of_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[np.ndarray,
         means: np.ndarray = np.bincount(ring, values) / np.maximum(np.bincount(ring), 1)
         return means
 
-    x, y, z = xyz.T
-    radius = np.hypot(x, y)
-    elevation = np.degrees(np.arctan2(z, radius))
+    elevation = elevations(xyz)
 
     # A tilt of the sensor adds one wave around the sensor to the elevations of all lasers.
-    waves = np.stack([x, y]) / radius
+    waves = xyz[:, :2].T / np.hypot(xyz[:, 0], xyz[:, 1])
     within = np.stack([values - means_of(values)[ring] for values in (*waves, elevation)])
     products = within @ within.T
     elevation -= np.linalg.lstsq(products[:2, :2], products[:2, 2])[0] @ waves
@@ -132,6 +131,6 @@ def _elevations_of_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[np.ndarray,
     return means, bool(spread <= MAX_RING_SPREAD * whole)
 
 
-def _falls(elevations: np.ndarray) -> bool:
-    """Return whether an elevation (L,) lies clearly below an earlier one."""
-    return bool((np.maximum.accumulate(elevations) - elevations > SAME_ELEVATION).any())
+def _falls(means: np.ndarray) -> bool:
+    """Return whether an elevation of (L,) lies clearly below an earlier one."""
+    return bool((np.maximum.accumulate(means) - means > SAME_ELEVATION).any())
