@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,17 +51,15 @@ def everything() -> str:
 
 def hidden() -> str:
     """Return the table of the scans that decided nothing about the weights, for new users."""
-    lines = [
-        "| Scans | Points with the right label | mIoU, seven classes | mIoU, all classes |",
-        "|---|---|---|---|",
-    ]
+    titles = ("Scans", "Points with the right label", "mIoU, seven classes", "mIoU, all classes")
+    lines = []
     for row in read()["rows"]:
         if row.get("hidden"):
             seven = f"{row['seven']['amvnet']:.1f}" if "seven" in row else ""
             scans = row["scans"].replace(", hidden", "")
             right = f"{row['accuracy']['amvnet']:.1f} %"
-            lines.append(f"| {scans} | {right} | {seven} | {row['amvnet']:.1f} |")
-    return "\n".join(lines)
+            lines.append([scans, right, seven, f"{row['amvnet']:.1f}"])
+    return markdown(titles, lines)
 
 
 def trust() -> str:
@@ -80,41 +79,34 @@ def trust() -> str:
         for cells, names in zip(bands.values(), chosen, strict=True):
             cells.append(", ".join(names))
 
-    lines = [f"| | {' | '.join(datasets)} |", f"|---{'|---' * len(datasets)}|"]
-    lines += [f"| {' | '.join([title, *cells])} |" for title, cells in bands.items()]
-    return "\n".join(lines)
+    return markdown(["", *datasets], [[title, *cells] for title, cells in bands.items()])
 
 
 def seven_classes() -> str:
     """Return the table of the IoU of AMVNet in each of the seven classes."""
-    lines = [f"| Scans | {' | '.join(SEVEN)} | mean |", f"|---{'|---' * (len(SEVEN) + 1)}|"]
+    lines = []
     for row in read()["rows"]:
         if "seven_classes" in row:
             figures = [*row["seven_classes"], row["seven"]["amvnet"]]
-            lines.append(f"| {row['scans']} | {' | '.join(f'{iou:.1f}' for iou in figures)} |")
-    return "\n".join(lines)
+            lines.append([row["scans"], *(f"{iou:.1f}" for iou in figures)])
+    return markdown(["Scans", *SEVEN, "mean"], lines)
 
 
 def finetuning() -> str:
     """Return the table of fine-tuning."""
-    lines = [
-        "| Labelled scans | Tested on | Zero-shot | Fine-tuned, with simulated streets |",
-        "|---|---|---|---|",
-    ]
+    lines = []
     for row in read()["finetuning"]:
-        cells = [row["labelled"], row["tested"]]
-        for miou, accuracy in (row["before"], row["after"]):
-            cells.append(f"{miou:.1f} ({accuracy:.1f})")
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        pairs = (row["before"], row["after"])
+        scores = [f"{miou:.1f} ({accuracy:.1f})" for miou, accuracy in pairs]
+        lines.append([row["labelled"], row["tested"], *scores])
+    titles = ("Labelled scans", "Tested on", "Zero-shot", "Fine-tuned, with simulated streets")
+    return markdown(titles, lines)
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as a table in Markdown; the best method of each row is in bold."""
-    lines = [
-        "| Scans | Weights | RV | BEV | Plain ensemble | Ensemble | AMVNet | Drive | Uncertain |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    methods = ("RV", "BEV", "Plain ensemble", "Ensemble", "AMVNet", "Drive")
+    lines = []
     for row in rows:
         best = max(row[method] for method in PRINTED_METHODS if method in row)
         cells = [row["scans"], f"`{row['weights']}`"]
@@ -125,8 +117,14 @@ def table(rows: list[dict[str, Any]]) -> str:
             text = f"{row[method]:.1f}"
             cells.append(f"**{text}**" if row[method] == best else text)
         cells.append(f"{row['uncertain']:g} %" if "uncertain" in row else "")
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown(["Scans", "Weights", *methods, "Uncertain"], lines)
+
+
+def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown, given the titles of its columns."""
+    header, *lines = (f"| {' | '.join(cells)} |" for cells in (titles, *rows))
+    return "\n".join([header, "|---" * len(titles) + "|", *lines])
 
 
 TABLES = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,9 +18,10 @@ import pytest
 import amvnet
 from amvnet.cli.options import FormatName
 from amvnet.data.formats.find import read_cloud
-from amvnet.data.labels.writers import KINDS, write_scan_labels
+from amvnet.data.labels.writers import KINDS, check_kind, write_scan_labels
 from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.drives.world_map import check_ending
 
 from fixtures.commands import fails, files, run_cli
 from fixtures.marks import with_quick
@@ -224,6 +226,15 @@ def test_an_unknown_format_is_named() -> None:
     xyz = np.zeros((1, 3))
     ids = np.zeros(1)
     fails(lambda: write_scan_labels(Path("a"), "xyz", xyz, ids, SEMANTICKITTI), "xyz", "ply")
+
+
+@pytest.mark.parametrize("missing", ["laspy", "lazrs"])
+def test_a_missing_package_is_named_before_the_work(
+    missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    for check in (lambda: check_kind("laz"), lambda: check_ending(Path("a.laz"))):
+        fails(check, "laz", missing, 'pip install "amvnet[formats]"')
 
 
 # --- predict ---

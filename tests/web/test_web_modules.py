@@ -235,20 +235,19 @@ def on_the_ground(folder: Path) -> Case:
 
 def on_a_mound(folder: Path) -> Case:
     """The ground is 0.6 m lower from 16 m on: how far cells count decides which level it is."""
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(-25, 25, (2, 20_000))
-    z = np.where(np.hypot(x, y) < 16, -1.9, -2.5) + 1.5 * (rng.random(len(x)) < 0.2)
-    points = np.column_stack([x, y, z, rng.random(len(x))])
-    return Case(write_bin(folder / "mound.bin", points))
+    return on_a_step(folder / "mound.bin", 16, -1.9, -2.5)
 
 
 def on_a_hump(folder: Path) -> Case:
     """The ground is 0.3 m lower from 6 m on, where most of it lies."""
+    return on_a_step(folder / "hump.bin", 6, -1.4, -1.7)
+
+
+def on_a_step(path: Path, radius: float, inner: float, outer: float) -> Case:
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-25, 25, (2, 20_000))
-    z = np.where(np.hypot(x, y) < 6, -1.4, -1.7) + 1.5 * (rng.random(len(x)) < 0.2)
-    points = np.column_stack([x, y, z, rng.random(len(x))])
-    return Case(write_bin(folder / "hump.bin", points))
+    z = np.where(np.hypot(x, y) < radius, inner, outer) + 1.5 * (rng.random(len(x)) < 0.2)
+    return Case(write_bin(path, np.column_stack([x, y, z, rng.random(len(x))])))
 
 
 def on_a_bank(folder: Path) -> Case:

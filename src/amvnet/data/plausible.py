@@ -21,9 +21,7 @@ MIN_FOLLOWING = 0.85  # smallest share of a scan's neighbours with equal labels 
 MIN_FOLLOWING_CLASS = 0.3  # smallest such share of a class, over all scans
 
 GROUND = "ground"  # the coarse class of the ground
-RAISED = (
-    1.0  # height over the lowest point of the square metre from which a point is raised, metres
-)
+RAISED = 1.0  # height over the lowest point of its square metre that raises a point, metres
 MAX_RAISED = 0.05  # largest share of the points of a class of the ground that are raised
 
 # Largest shares of all points that one class has on any street, by its coarse class.

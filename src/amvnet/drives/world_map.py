@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from amvnet.data.class_maps import class_map
-from amvnet.data.labels.clouds import COLORS, check_laspy, write_cloud
+from amvnet.data.formats.registry import check_packages
+from amvnet.data.labels.clouds import COLORS, write_cloud
 from amvnet.data.palette import class_colors
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
@@ -195,4 +196,4 @@ def check_ending(path: Path) -> None:
             f"{path}: expected a name that ends in {', '.join(SIGNATURES)}, found "
             f"{path.suffix or 'no ending'}; rename it"
         )
-    check_laspy(path, path.suffix)
+    check_packages(path, path.suffix)

@@ -44,22 +44,18 @@ def train(plan: Plan) -> Path:
         if plan.processes.first:
             write_record(plan)
             keep_counts(plan, checked.class_counts)
-        return _train_stages(plan, checked)
 
-
-def _train_stages(plan: Plan, checked: Checked) -> Path:
-    """Train the stages of a plan in a folder that no other call writes into."""
-    # Save after each stage, so that a stage that fails does not lose the earlier ones.
-    path = plan.out / WEIGHTS
-    weights = checked.weights
-    for name in plan.stages:
-        weights = train_stage(plan, checked, name, weights)
+        # Save after each stage, so that a stage that fails does not lose the earlier ones.
+        path = plan.out / WEIGHTS
+        weights = checked.weights
+        for name in plan.stages:
+            weights = train_stage(plan, checked, name, weights)
+            if plan.processes.first:
+                save(with_finished(plan, weights), path)
+            plan.processes.wait()
         if plan.processes.first:
-            save(with_finished(plan, weights), path)
-        plan.processes.wait()
-    if plan.processes.first:
-        _draw_curves(plan)
-    return path
+            _draw_curves(plan)
+        return path
 
 
 def _draw_curves(plan: Plan) -> None:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
 from amvnet.cli.console import progress, report, show
 from amvnet.cli.options import TrainingChoice
 from amvnet.errors import InputError, SomeBroken
 from amvnet.progress import counted
+
+if TYPE_CHECKING:
+    from amvnet.data.datasets.base import Dataset, ScanRecord
 
 
 def check(data: str, /, choice: TrainingChoice) -> None:
@@ -17,21 +23,26 @@ def check(data: str, /, choice: TrainingChoice) -> None:
         data: the dataset.
         choice: which scans to check in addition to the labelled scans of the test split.
     """
-    from amvnet.cli.tables import contents_table, unknown_table
-    from amvnet.data.check import check_scans
     from amvnet.data.datasets.open import open_dataset
     from amvnet.inference.reading import described_sensor
 
     dataset = open_dataset(data)
     described_sensor(dataset)
-    refused = None
     try:
         splits = choice.splits(dataset)
-    except InputError as error:
-        if choice != TrainingChoice():
-            raise
-        refused = error
-        splits = {"all": dataset.records(dataset.trainable())}
+    except InputError:
+        if choice == TrainingChoice():
+            _check(dataset, {"all": dataset.records(dataset.trainable())})
+        raise
+    scans = _check(dataset, splits)
+    report(f"{counted(scans, 'scan')} can be trained on or scored")
+
+
+def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanRecord]]) -> int:
+    """Print what the labels of some scans are, and return the number of scans."""
+    from amvnet.cli.tables import contents_table, unknown_table
+    from amvnet.data.check import check_scans
+
     with progress("checking") as step:
         checked = check_scans(dataset, splits, step)
 
@@ -55,7 +66,4 @@ def check(data: str, /, choice: TrainingChoice) -> None:
             "out",
             list(broken.values()),
         )
-    if refused is not None:
-        raise refused
-    scans = sum(len(split.scans) for split in checked.splits.values())
-    report(f"{counted(scans, 'scan')} can be trained on or scored")
+    return sum(len(split.scans) for split in checked.splits.values())

@@ -70,8 +70,8 @@ def named_sequences(
                 "divide it under split in a YAML file that describes the scans (docs/own_data.md)"
             )
         for split, named in (("val", val), ("train", train)):
-            if not named:
-                dataset.sequences(split)  # a split without a sequence has its own message
+            if not named and not usual[split]:
+                raise InputError(dataset.lacks(split))
         raise InputError(
             f"{dataset.spec}: expected two sequences, one to train on and one to validate with, "
             f"found {', '.join(dataset.splits()['all'])}; name them"

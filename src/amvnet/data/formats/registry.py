@@ -106,17 +106,27 @@ def _read_scan(path: Path, bag: tuple[str, str | None, str], index: int) -> Clou
     return Cloud(**_call(read_from_bag, path, ending, index, *bag))
 
 
+def check_packages(place: object, ending: str) -> None:
+    """Raise InputError if a format needs a package that is missing.
+
+    Args:
+        place: the beginning of the message.
+        ending: the ending of the format.
+    """
+    missing = [package for package in PACKAGES.get(ending, ()) if find_spec(package) is None]
+    if missing:
+        raise InputError(
+            f"{place}: expected the package {' and '.join(missing)}, found none; "
+            f'run pip install "amvnet[{EXTRAS.get(missing[0], "formats")}]"'
+        )
+
+
 def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any) -> Any:
     """Call a function that reads a file; the process with limits runs it if `PACKAGES` says so."""
     if ending not in PACKAGES:
         return function(path, *arguments)
 
-    missing = [package for package in PACKAGES[ending] if find_spec(package) is None]
-    if missing:
-        raise InputError(
-            f"{path}: expected the package {' and '.join(missing)}, found none; "
-            f'run pip install "amvnet[{EXTRAS.get(missing[0], "formats")}]"'
-        )
+    check_packages(path, ending)
     with readable(path):
         return call(function, path, *arguments)
 

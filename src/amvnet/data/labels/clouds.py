@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
-from amvnet.errors import InputError
-
 Columns = dict[str, np.ndarray]
 
-ENDINGS = (".ply", ".pcd", ".las", ".laz")
 COLORS = ("red", "green", "blue")
 PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u2": "ushort", "u1": "uchar"}
 PCD_HEADER = "# .PCD v0.7 - labels of amvnet\nVERSION 0.7"
@@ -21,25 +17,12 @@ MILLIMETRE = 0.001
 FARTHEST = 1_000_000.0  # largest coordinate, metres, from which 32 bits of millimetres reach 0
 
 
-def check_laspy(place: object, ending: str) -> None:
-    """Raise InputError if laspy is missing and an ending needs it.
-
-    Args:
-        place: the beginning of the message.
-    """
-    if ending in (".las", ".laz") and find_spec("laspy") is None:
-        raise InputError(
-            f"{place}: expected the package laspy for this format, found none; run pip install "
-            '"amvnet[formats]", or write .ply'
-        )
-
-
 def write_cloud(path: Path, ending: str, columns: Columns, program: str = "amvnet") -> None:
     """Write points in the format of an ending.
 
     Args:
         path: the file.
-        ending: one of `ENDINGS`.
+        ending: .ply, .pcd, .las or .laz.
         columns: (N,) x, y and z in metres; red, green and blue, uint8; class, int32; and any
             others. LAS has coordinates in millimetres, lost points (NaN) at 0, 0, 0 (in map
             coordinates, at their lowest corner), and the class as `classification` if all ids are

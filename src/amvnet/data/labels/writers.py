@@ -8,7 +8,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from amvnet.data.labels.clouds import COLORS, PCD_HEADER, check_laspy, write_cloud
+from amvnet.data.formats.registry import check_packages
+from amvnet.data.labels.clouds import COLORS, PCD_HEADER, write_cloud
 from amvnet.data.labels.ids import check_count, write_ids
 from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
@@ -50,7 +51,7 @@ def check_kind(kind: str) -> None:
         raise InputError(
             f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them"
         )
-    check_laspy(f"format {kind}", f".{kind}")
+    check_packages(f"format {kind}", f".{kind}")
 
 
 def write_scan_labels(
