@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -220,6 +221,22 @@ def test_an_existing_file_survives_a_write_that_fails(
 
     assert path.read_bytes() == before
     assert files(tmp_path) == {path.name}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_disk_without_space_is_an_error_of_the_system_that_names_the_file(
+    kind: str, tmp_path: Path
+) -> None:
+    xyz, ids, _ = make_scan()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    largest = write_scan_labels(tmp_path / "b", kind, xyz, ids, SEMANTICKITTI).stat().st_size
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest - 1, limits[1]))
+    try:
+        with pytest.raises(OSError, match=f"a.{kind}"):
+            write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert files(tmp_path) == {f"b.{kind}"}
 
 
 def test_an_unknown_format_is_named() -> None:
