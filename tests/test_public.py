@@ -197,6 +197,9 @@ def test_a_scan_is_never_replaced_by_its_labels(tmp_path: Path, segmenter: Segme
     write_pcd(tmp_path / "a.ply", POINTS, "binary")
     before = (tmp_path / "a.ply").read_bytes()
     result = segmenter(tmp_path / "a.ply")
+    assert result.save(tmp_path / "b.ply") == tmp_path / "b.ply"
+    labelled = segmenter(amvnet.read(tmp_path / "b.ply"))
+    fails(partial(labelled.save, tmp_path / "b.ply"), "b.ply", "found the input")
     (tmp_path / "link.ply").symlink_to(tmp_path / "a.ply")
     os.link(tmp_path / "a.ply", tmp_path / "hard.ply")
     for name in ("a.ply", "link.ply", "hard.ply", "../" + tmp_path.name + "/a.ply"):
@@ -247,6 +250,8 @@ def test_show_takes_points_and_adds_the_ending_of_a_page(tmp_path: Path) -> None
         assert len(xyz) == len(POINTS)
         assert set(planes) == {"intensity"}
     fails(lambda: amvnet.show(POINTS * np.nan, tmp_path / "n"), "expected points")
+    for folder in ("", ".", "..", "/"):
+        fails(partial(amvnet.show, POINTS, folder, open_browser=False), "found a folder")
 
 
 def test_the_listed_weights_can_be_loaded() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -220,6 +221,26 @@ def test_an_existing_file_survives_a_write_that_fails(
 
     assert path.read_bytes() == before
     assert files(tmp_path) == {path.name}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_disk_without_space_is_an_error_of_the_system_that_names_the_file(
+    kind: str, tmp_path: Path
+) -> None:
+    """Libraries hide the reason, and NumPy ignores it in the last block of a file."""
+    xyz = np.random.default_rng(0).normal(scale=20, size=(5000, 3))
+    ids = np.ones(len(xyz), np.uint8)
+    whole = write_scan_labels(tmp_path / "b", kind, xyz, ids, SEMANTICKITTI)
+    size = whole.stat().st_size
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for space in (0, size // 2, size - 1):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (space, limits[1]))
+        try:
+            with pytest.raises(OSError, match=f"a.{kind}"):
+                write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert files(tmp_path) == {whole.name}
 
 
 def test_an_unknown_format_is_named() -> None:

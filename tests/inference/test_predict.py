@@ -242,7 +242,7 @@ def test_a_killed_run_goes_on_where_it_stopped(
 
 
 @pytest.mark.parametrize("options", with_full(["", "--overwrite", "--resume"], ["--overwrite"]))
-def test_the_output_of_a_run_is_checked_once_before_the_networks_are_loaded(
+def test_the_output_is_checked_before_the_networks_are_loaded_and_when_the_run_is_alone_in_it(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str
 ) -> None:
     steps: list[str] = []
@@ -254,7 +254,7 @@ def test_the_output_of_a_run_is_checked_once_before_the_networks_are_loaded(
     monkeypatch.setattr("amvnet.inference.pipeline.check_outputs", lambda *_: steps.append("check"))
     monkeypatch.setattr("amvnet.cli.commands.predict.load_segmenter", load)
     succeed(predict(world, tmp_path, options))
-    assert steps == ["check", "load"]
+    assert steps == ["check", "load", "check"]
 
 
 def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_path: Path) -> None:
@@ -512,11 +512,11 @@ def test_the_journal_is_at_most_as_late_as_the_writing(tmp_path: Path) -> None:
 HOLD = """
 import sys
 from pathlib import Path
-from amvnet.inference.journal import Journal
+from amvnet.files import alone_in
 
-journal = Journal(Path(sys.argv[1]), {})
-print("ready", flush=True)
-sys.stdin.read()
+with alone_in(Path(sys.argv[1])):
+    print("ready", flush=True)
+    sys.stdin.read()
 """
 
 
@@ -531,6 +531,22 @@ def test_a_folder_belongs_to_one_run_at_a_time(world: Path, tmp_path: Path) -> N
 
     succeed(predict(world, tmp_path))
     assert len(files(tmp_path)) == SCANS
+
+
+def test_a_run_replaces_no_labels_of_a_run_that_ended_while_it_loaded_its_networks(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = load_segmenter
+
+    def load_slowly(*arguments: Any) -> Segmenter:
+        monkeypatch.undo()
+        succeed(predict(world, tmp_path, "--method rv"))
+        return load(*arguments)
+
+    monkeypatch.setattr("amvnet.cli.commands.predict.load_segmenter", load_slowly)
+    assert "expected no file" in refusal(predict(world, tmp_path))
+    (settings,) = read_journals(tmp_path).settings
+    assert settings["method"] == "rv"
 
 
 def test_what_a_killed_run_left_half_written_is_taken_away(

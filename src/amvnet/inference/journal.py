@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from amvnet.errors import InputError
-from amvnet.files import alone_in, atomic_write, remove_unfinished
+from amvnet.files import atomic_write, remove_unfinished
 
 JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
 UNFINISHED = ".unfinished.jsonl"  # the name of the journal during the run
@@ -44,15 +43,14 @@ class Journal:
     missing or torn: these scans are done again. If a scan is in the journal, its output is on the
     disk, because `atomic_write` puts it there first.
 
+    The caller keeps other runs out of the folder (`alone_in`).
+
     Leaving a `with` block closes the file; the run stays unfinished unless `close` ended it.
 
     Args:
         folder: the output folder; it is made if it is missing.
         settings: all that the output depends on, in JSON types.
         done: entries of an earlier run that stay valid, from `read_journals`.
-
-    Raises:
-        InputError: if another run is writing into the folder.
     """
 
     def __init__(
@@ -61,8 +59,6 @@ class Journal:
         self.folder = folder
         self.path = folder / UNFINISHED
 
-        self._alone = ExitStack()
-        self._alone.enter_context(alone_in(folder))
         remove_unfinished(folder)
         _write(self.path, settings, done)
         self._file = self.path.open("a")
@@ -73,7 +69,6 @@ class Journal:
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
-        self._alone.close()
 
     def add(self, entry: Entry) -> None:
         """Add the entry of a scan that is done."""

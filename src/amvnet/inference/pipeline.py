@@ -7,7 +7,7 @@ import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -24,7 +24,7 @@ from amvnet.data.labels.writers import (
     write_uncertain,
 )
 from amvnet.errors import InputError, SomeBroken, memory_for
-from amvnet.files import atomic_write, inside
+from amvnet.files import alone_in, atomic_write, inside
 from amvnet.inference.drive import Drives
 from amvnet.inference.journal import UNFINISHED, Entry, Journal, check_unchanged, read_journals
 from amvnet.inference.listing import InputScan, LoadedScan, Outcome
@@ -119,47 +119,44 @@ class Pipeline:
             a line for each scan that is broken.
 
         Raises:
-            InputError: if the run that is resumed had other settings, or another run is writing
-                into the folder.
+            InputError: if the run that is resumed had other settings, another run is writing into
+                the folder, or `check_output` raises it.
         """
         folder = self.output.folder
-        is_new = not folder.exists()
-        earlier = read_journals(folder)
-        changed = earlier.changed(settings)
-        if self.output.resume:
-            advice = "start over with --overwrite instead of --resume"
-            check_unchanged(folder, changed, advice)
-        kept = {} if changed else self._kept(earlier.entries)
-        remaining = [scan for scan in self.scans if _key(scan) not in kept]
+        with alone_in(folder):
+            check_output(self.scans, self.output)  # another run may have ended meanwhile
+            earlier = read_journals(folder)
+            changed = earlier.changed(settings)
+            if self.output.resume:
+                advice = "start over with --overwrite instead of --resume"
+                check_unchanged(folder, changed, advice)
+            kept = {} if changed else self._kept(earlier.entries)
+            remaining = [scan for scan in self.scans if _key(scan) not in kept]
 
-        # Scans around the remaining ones are segmented again, if labels depend on them.
-        segmented = remaining
-        if self.drives is not None:
-            segmented = self.drives.in_reach(self.scans, remaining)
-        new = {_key(scan) for scan in remaining}
+            # Scans around the remaining ones are segmented again, if labels depend on them.
+            segmented = remaining
+            if self.drives is not None:
+                segmented = self.drives.in_reach(self.scans, remaining)
+            new = {_key(scan) for scan in remaining}
 
-        def write(outcome: Outcome) -> Entry | str | None:
-            return self.write_or_explain(outcome) if _key(outcome[0]) in new else None
+            def write(outcome: Outcome) -> Entry | str | None:
+                return self.write_or_explain(outcome) if _key(outcome[0]) in new else None
 
-        faults: list[str] = []
-        with Journal(folder, settings, kept.values()) as journal:
-            count = 0
-            for outcome in self.stream(segmented, write):
-                if outcome is None:
-                    continue
-                progress(count, len(remaining))
-                count += 1
-                if isinstance(outcome, Entry):
-                    journal.add(outcome)
-                else:
-                    faults.append(outcome)
-            progress(len(remaining), len(remaining))
-            entries = journal.close()
-
-        if is_new:
-            with suppress(OSError):  # the folder is empty only if all scans were broken
-                folder.rmdir()
-        return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
+            faults: list[str] = []
+            with Journal(folder, settings, kept.values()) as journal:
+                count = 0
+                for outcome in self.stream(segmented, write):
+                    if outcome is None:
+                        continue
+                    progress(count, len(remaining))
+                    count += 1
+                    if isinstance(outcome, Entry):
+                        journal.add(outcome)
+                    else:
+                        faults.append(outcome)
+                progress(len(remaining), len(remaining))
+                entries = journal.close()
+            return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
     def _kept(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return the entries of an earlier run with equal settings that stay in the journal.

@@ -279,7 +279,8 @@ class Segmentation:
                 f"{path}: expected a name that ends in .{', .'.join(KINDS)}, "
                 f"found {path.suffix or 'no ending'}; rename it"
             )
-        check_outputs({path: SIGNATURES[path.suffix]}, [origin.path], overwrite=True)
+        read = [origin.path, origin.scan.name]  # the name of a scan of `amvnet.read` is its path
+        check_outputs({path: SIGNATURES[path.suffix]}, read, overwrite=True)
 
         return write_scan_labels(
             path.with_suffix(""),

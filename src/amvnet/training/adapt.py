@@ -14,6 +14,7 @@ import numpy as np
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.labels.ids import write_array
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, inside, temporary_folder
@@ -150,8 +151,8 @@ def teach(
             teaches = (probabilities.max(axis=1) > LEAST_PROBABILITY) & (sights >= LEAST_SIGHTS)
             ids = np.where(teaches, labels, 0).astype(np.uint8)
             taught += int(np.count_nonzero(ids))
-            with atomic_write(inside(folder, label_path(scan))) as part, part.open("wb") as file:
-                np.save(file, ids)
+            with atomic_write(inside(folder, label_path(scan))) as part:
+                write_array(part, ids)
     if folder is not None and not taught:
         seen = "" if drives is None else f" in voxels that {LEAST_SIGHTS} scans see"
         raise InputError(

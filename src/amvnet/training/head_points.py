@@ -263,7 +263,7 @@ class PointGatherer:
                 points, labels, scan_matrices = self._gather_scan(
                     scans, key, scorer, assertion, points_per_scan
                 )
-                points.tofile(file)
+                file.write(points.tobytes())
                 labels_of_scans.append(labels)
                 matrices += scan_matrices
                 if tenths.ends(number, len(share)):

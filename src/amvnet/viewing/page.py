@@ -129,7 +129,9 @@ def show(
 def page_name(path: Path | str) -> Path:
     """Return the path of a page, with the ending `.html` if it has none of a page."""
     path = Path(path)
-    return path if path.suffix.lower() in (".html", ".htm") else path.with_name(f"{path.name}.html")
+    if path.name in ("", "..") or path.suffix.lower() in (".html", ".htm"):
+        return path  # such as "." or "/", which `check_outputs` refuses
+    return path.with_name(f"{path.name}.html")
 
 
 @contextmanager

@@ -18,6 +18,7 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.formats.raw import FULL_INTENSITY
+from amvnet.data.labels.ids import write_array
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError, one_line_errors, shown
 from amvnet.files import temporary_folder
@@ -205,7 +206,7 @@ def _write(folder: Path, scan: Scan) -> None:
     arrays = {"points": scan.points, "labels": scan.labels, "ring": scan.ring}
     for name, array in arrays.items():
         if array is not None:
-            np.save(folder / f"{name}.npy", array)
+            write_array(folder / f"{name}.npy", array)
 
 
 def _put(part: Path, street: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -100,5 +101,6 @@ def _write_las(path: Path, columns: Columns, program: str, packed: bool) -> None
     cloud.classification = classification.astype(np.uint8)
     for name, values in others.items():
         cloud[name] = values
-    with path.open("wb") as file:
-        cloud.write(file, do_compress=packed, laz_backend=laspy.LazBackend.Lazrs)
+    content = BytesIO()  # lazrs hides the system's reason if it cannot write a file
+    cloud.write(content, do_compress=packed, laz_backend=laspy.LazBackend.Lazrs)
+    path.write_bytes(content.getbuffer())

@@ -6,6 +6,7 @@ ids instead of raw ids.
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -47,8 +48,19 @@ def write_ids(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint3
     The official `.label` files hold uint32.
     """
     with atomic_write(path) as part:
-        np.asarray(raw_ids).astype(dtype).tofile(part)
+        part.write_bytes(np.asarray(raw_ids).astype(dtype).tobytes())
     return Path(path)
+
+
+def write_array(path: Path, values: np.ndarray) -> None:
+    """Write an array as `.npy`, whatever the ending of the path.
+
+    If the disk is full, NumPy leaves out the end of an array without an error: call neither
+    `tofile` nor `np.save` for a file.
+    """
+    content = BytesIO()
+    np.save(content, values)
+    path.write_bytes(content.getbuffer())
 
 
 def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from amvnet.data.formats.registry import check_packages
 from amvnet.data.labels.clouds import COLORS, PCD_HEADER, write_cloud
-from amvnet.data.labels.ids import check_count, write_ids
+from amvnet.data.labels.ids import check_count, write_array, write_ids
 from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -95,7 +95,7 @@ def write_scan_labels(
 
     with atomic_write(path) as part:
         if kind == "npy":
-            np.save(part, raw)
+            write_array(part, raw)
             return path
 
         columns = _coordinates(xyz)
@@ -111,7 +111,7 @@ def write_scan_labels(
 def write_uncertain(path: Path, uncertain: np.ndarray) -> Path:
     """Write which points are uncertain, (N,) bool, as `.npy`."""
     with atomic_write(path) as part:
-        np.save(part, np.asarray(uncertain, dtype=bool))
+        write_array(part, np.asarray(uncertain, dtype=bool))
     return path
 
 
