@@ -29,6 +29,7 @@ from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails, files, succeed
 from fixtures.exports import shallow_weights
+from fixtures.sensors import rings_of
 from fixtures.tiny import fresh_weights, street, trained_for, with_intensities, without
 
 POINTS = 3000
@@ -192,7 +193,7 @@ def test_one_scan_and_rows_by_ring_do(scans: Path, tmp_path: Path) -> None:
 
     points = read_points(scans / "000003.bin")
     segmenter = OnnxSegmenter(tmp_path / "out")
-    assert segmenter(points, np.arange(POINTS) % 16).labels.all()
+    assert segmenter(points, rings_of(points, 16)).labels.all()
 
 
 # ---- mistakes

@@ -272,6 +272,6 @@ def test_every_command_of_the_page_runs(
         if "val" in arguments:
             # The page assumes that the validation split has been predicted.
             options = ("--sequences", "08", "--weights", "runs/kitti", "--out", "predictions")
-            run_cli("predict", arguments[1], *options)
+            assert run_cli("predict", arguments[1], *options, "--resume") == (0, "")
 
         assert run_cli(*arguments) == (0, ""), command
