@@ -120,6 +120,12 @@ def stretched(poses: Poses) -> Poses:
     return poses
 
 
+def a_quarter_longer(poses: Poses) -> Poses:
+    poses = poses.copy()
+    poses[:, :3, 3] *= 1.25
+    return poses
+
+
 def backwards(poses: Poses) -> Poses:
     return poses[::-1].copy()
 
@@ -134,7 +140,7 @@ def lost(poses: Poses) -> Poses:
     return poses
 
 
-@pytest.mark.parametrize("spoil", [of_camera, stretched, backwards, fewer, lost])
+@pytest.mark.parametrize("spoil", [of_camera, stretched, a_quarter_longer, backwards, fewer, lost])
 def test_poses_that_do_not_fit_are_one_line_and_nothing_is_written(
     world: Path, tmp_path: Path, spoil: Callable[[Poses], Poses]
 ) -> None:
