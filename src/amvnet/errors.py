@@ -35,8 +35,6 @@ def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") ->
     """Return the end of an error message: the most similar known name, or else the advice.
 
     Args:
-        word: the unknown word.
-        known: the known names.
         advice: what the user should do if no name is similar.
     """
     names = {name.lower(): name for name in known}
@@ -118,10 +116,6 @@ def readable(path: object) -> Iterator[None]:
 
 def import_optional(module: str, extra: str) -> Any:
     """Import a module that needs the packages of an extra.
-
-    Args:
-        module: the name of the module.
-        extra: the name of the extra of this package.
 
     Raises:
         InputError: if one of the packages is not installed.

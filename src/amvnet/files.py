@@ -125,7 +125,6 @@ def alone_in(folder: Path, lock: str = ".lock") -> Iterator[None]:
     leaves it empty.
 
     Args:
-        folder: the output folder.
         lock: the name of the file that is locked, which exists only during the block.
 
     Raises:

@@ -31,8 +31,6 @@ def counted(count: int, noun: str, plural: str = "") -> str:
     """Return a number of things in words, such as "1 scan" or "2 scans".
 
     Args:
-        count: the number.
-        noun: the noun in the singular.
         plural: the noun in the plural if it is irregular.
     """
     return f"{count} {noun}" if count == 1 else f"{count} {plural or f'{noun}s'}"

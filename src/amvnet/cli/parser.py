@@ -173,7 +173,6 @@ def make_parser(command: str, run: Callable[..., None]) -> Parser:
     """Return the parser of a command, without the values of a recipe.
 
     Args:
-        command: the name of the command.
         run: the function that does the work. Its signature and its docstring define the arguments
             and the options. Positional-only parameters are arguments. A parameter of a dataclass
             type stands for a group of options. Each field of the dataclass is an option, and the
@@ -212,7 +211,6 @@ def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
     """Run a command with the values of its options.
 
     Args:
-        run: the function of the command.
         values: the values by the name of the argument or option.
     """
     hints = get_type_hints(run)

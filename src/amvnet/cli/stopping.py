@@ -71,7 +71,6 @@ def stoppable(line: str, exits: bool) -> Iterator[Stop]:
     """Yield a `Stop`, which raises KeyboardInterrupt in the block at SIGINT or SIGTERM.
 
     Args:
-        line: the line to print when the command has stopped.
         exits: whether this process belongs to the command line.
     """
     stop = Stop(line, exits)

@@ -30,7 +30,6 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 
     Args:
         report: the result of `Evaluation.report`.
-        taxonomy: the classes of the evaluation.
     """
     methods = report["methods"]
     figures = list(methods.values())
@@ -90,7 +89,6 @@ def labelled_table(counts: Sequence[Sequence[int]], taxonomy: Taxonomy) -> Table
 
     Args:
         counts: for each scan, the number of points of each train id, from 0.
-        taxonomy: the classes of the labels.
     """
     totals = Counter[str]()
     for of_scan in counts:

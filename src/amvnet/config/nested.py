@@ -102,11 +102,7 @@ def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
 
 
 def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
-    """Convert a value to the type of a field.
-
-    Raises:
-        InputError: if the value does not fit the type.
-    """
+    """Convert a value to the type of a field."""
     wrong_type = InputError(
         f"{where}: expected a value like {default!r}, found {shown(value)}; correct the value"
     )

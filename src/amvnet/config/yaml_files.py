@@ -21,7 +21,6 @@ def read_yaml(path: Path, content: str) -> Any:
     Nothing in the file is executed.
 
     Args:
-        path: the file.
         content: the expected content, for messages, such as "a label map".
 
     Raises:
@@ -43,7 +42,6 @@ def parse_yaml(text: str, expected: str) -> Any:
     """Return the value of a YAML text. Nothing in it is executed.
 
     Args:
-        text: the text.
         expected: the beginning of error messages.
 
     Raises:

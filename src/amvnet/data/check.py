@@ -254,9 +254,7 @@ def check_scans(
     Several threads read the scans.
 
     Args:
-        dataset: the dataset.
         splits: the scans by the name of the split; scans without labels are only counted.
-        progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans; each process returns the report on all scans.
     """
     labelled = {}
@@ -288,11 +286,7 @@ def _find_contents(
     progress: Progress,
     processes: Processes,
 ) -> dict[str, Contents | str]:
-    """Return the contents of scans, or the message about a broken scan, by the name of the scan.
-
-    Args:
-        records: labelled scans by name.
-    """
+    """Return the contents of scans, or the message about a broken scan, by the name of the scan."""
     found: dict[str, Contents | str] = {}
     share = processes.share(list(records.values()))
     for part in processes.gather(_read_all(dataset, share, progress)):

@@ -215,8 +215,6 @@ def describe_difference(classes: Sequence[str], others: Sequence[str], of_others
     """Describe how some classes differ from others, by their names.
 
     Args:
-        classes: names of classes.
-        others: other names of classes.
         of_others: what has the other classes, such as "the weights".
     """
     missing = [name for name in classes if name not in others]
@@ -235,7 +233,6 @@ def class_entries(classes: Any, key: str, example: str) -> dict[str, dict[str, A
     Args:
         classes: the entries in a YAML file. An entry is a mapping, or only the value of `key`.
         key: the key that every class must have.
-        example: an entry that error messages show.
 
     Raises:
         InputError: if there are no classes, a name is not a text, or a colour is not a list of
@@ -288,7 +285,6 @@ def user_taxonomy(
     """Return the taxonomy of a user's classes.
 
     Args:
-        name: the name of the taxonomy.
         entries: the classes, as `class_entries` returned them.
         raw_to_train, train_to_raw: as in `Taxonomy`.
 

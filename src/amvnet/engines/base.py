@@ -75,11 +75,7 @@ class Engine:
 
     @torch.inference_mode()
     def score(self, batch: PointBatch) -> Scores:
-        """Return the scores of the points of a batch.
-
-        Args:
-            batch: points on the engine's device.
-        """
+        """Return the scores of the points of a batch, which is on the device of the engine."""
         model = self.model
         if METHODS[self.method].has_two_networks:
             scores: Scores = model(batch)
@@ -112,7 +108,6 @@ def build_model(
     """Return AMVNet with trained weights, set up for a method; it cannot be trained.
 
     Args:
-        weights: trained weights.
         method: how the points are scored, one of `METHODS`.
         tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
 

@@ -50,7 +50,6 @@ class GraphCheck:
 
         Args:
             score: scores a batch by a model whose networks are `Captured`.
-            batch: points on the GPU.
         """
         if not self.is_passed or batch.count in self._checked:
             return score(batch)

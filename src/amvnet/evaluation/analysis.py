@@ -70,10 +70,8 @@ def swept_row(value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxo
     """Return the row of one value of a parameter.
 
     Args:
-        value: the value.
         uncertain: share of uncertain points, in [0, 1].
         matrix: (K + 1, K + 1) confusion matrix of AMVNet.
-        taxonomy: the classes.
     """
     figures = metrics(matrix, taxonomy)
     return value, 100 * uncertain, 100 * (figures["miou"] or 0), 100 * (figures["accuracy"] or 0)
@@ -88,10 +86,7 @@ def analyze(
     """Score labelled scans by every method, and by the head on all points that some tau selects.
 
     Args:
-        dataset: the dataset that reads the scans.
-        records: the scans.
         segmenter: segments the scans; its method is "amvnet".
-        progress: called with the number of scans that are done, and their total.
 
     Raises:
         InputError: if the weights lack a part, or a scan has no true labels.

@@ -41,8 +41,6 @@ def files_of(out: Path, figures: Sequence[str], tables: Sequence[str]) -> dict[P
     """Return the files of some figures, their tables, and some other tables in a folder.
 
     Args:
-        out: the folder.
-        figures: names of figures.
         tables: names of tables without a figure.
     """
     files = {out / f"{name}.csv": TABLE for name in (*figures, *tables)}
@@ -66,10 +64,7 @@ def write_sweep(
     """Write Figure 8 of the paper: mIoU and share of uncertain points; return the files.
 
     Args:
-        rows: the figures for each value of the parameter.
-        name: the name of the parameter.
         used: the value of the parameter in the weights.
-        dataset: the name of the dataset, for the title.
         path: the path of the files to write, without an ending.
     """
     values, shares, mious, _ = zip(*rows, strict=True)

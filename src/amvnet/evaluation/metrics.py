@@ -177,11 +177,7 @@ class Evaluation:
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
-        """Return all metrics, over all points and by distance, as a dictionary for JSON.
-
-        Args:
-            dataset: the name of the dataset.
-        """
+        """Return all metrics, over all points and by distance, as a dictionary for JSON."""
         methods = {}
         for method, matrices in self.matrices.items():
             bins = []

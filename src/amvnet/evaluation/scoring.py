@@ -93,11 +93,7 @@ def evaluate(
     """Score the labels of some scans.
 
     Args:
-        dataset: the dataset that reads the scans.
-        records: the scans.
-        labeller: labels the scans.
         pictures: folder for pictures of a few scans from above. By default, none are drawn.
-        progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans. Each returns the evaluation of all scans.
         drives: the poses of the scans, if the method `DRIVE` is to be scored as well. The networks
             then get each scan twice: as it is, and turned.

@@ -43,10 +43,8 @@ def cached_networks(
     processes may use the cache at the same time.
 
     Args:
-        weights: trained weights.
         int8: the scans for the calibration, as `export` takes them; by default, the graphs are in
             float32.
-        report: called with a line before long work.
 
     Raises:
         InputError: if `export` raises it.

@@ -257,12 +257,7 @@ def _shown_path(row: Row) -> str:
 
 
 def statistics(result: Segmentation, taxonomy: Taxonomy) -> Row:
-    """Return the statistics of a scan's labels for the table of results, by column.
-
-    Args:
-        result: the labels of the scan, with ids of the written classes.
-        taxonomy: the written classes.
-    """
+    """Return the statistics of a scan's labels for the table of results, by column."""
     ids = result.labels
     size = taxonomy.size + 1
     counts = np.bincount(ids, minlength=size)

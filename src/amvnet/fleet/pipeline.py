@@ -89,10 +89,7 @@ def label_fleet(
 
     Args:
         inputs: the scans, as `list_scans` takes them.
-        request: how the scans are labelled, and which files are written.
         out: the URL or the path of the output folder.
-        resume: continue an earlier run into the same folder.
-        progress: called with the number of scans that are done, and their total so far.
         report: takes lines about what was assumed of the sensors, and how sure the labels are.
 
     Returns:
@@ -283,10 +280,6 @@ class FleetRun:
         Yields:
             The table that a worker returns for each block, except for lost blocks. A block is lost
             if every worker that takes it ends.
-
-        Raises:
-            InputError: if the workers cannot be started.
-            InputError: if more than `max_lost` blocks are lost.
         """
         context = ray.data.DataContext.get_current()
         context.enable_progress_bars = False

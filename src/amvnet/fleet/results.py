@@ -197,11 +197,7 @@ class Results:
 
 
 def _read(place: Place, schema: pa.Schema) -> pa.Table:
-    """Read a table that has the columns of a schema, and no null in the first column.
-
-    Raises:
-        InputError: if the table cannot be read, or has other columns.
-    """
+    """Read a table that has the columns of a schema, and no null in the first column."""
     with reaching(place.url):
         table = pa.parquet.read_table(BytesIO(place.read()))
     found = ""
@@ -269,7 +265,6 @@ def describe_drive(drive: str, assumed: str, usual: Estimate | None) -> dict[str
     """Return the row of a drive in the table of drives, which all workers and later runs use.
 
     Args:
-        assumed: a line about what was assumed of the sensor.
         usual: the median of what the first scans show of the sensor; None if they cannot be read,
             or have several sensors.
     """

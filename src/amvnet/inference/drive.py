@@ -242,8 +242,6 @@ def find_poses(
             has this name (`BagPoses`).
         past_only: whether only scans before a scan will count.
         is_one: whether all scans must be of one drive.
-        progress: called with the number of scans whose poses are estimated, and their total.
-        report: takes the lines.
 
     Raises:
         InputError: if a recording has a single scan; if the file or the topic does not have a pose

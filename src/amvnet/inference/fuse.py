@@ -155,9 +155,6 @@ def fuse_files(
 
     Args:
         inputs: the scans, as `list_inputs` takes them.
-        pair: the scores of both models.
-        output: which files are written, and where.
-        options: which scans of the inputs to use.
         head: weights with a point head. Without them, the labels are the ensemble's.
         tau: the threshold of the assertion, in [0, 1]; by default the threshold of the head's
             weights, or of the paper without a head.

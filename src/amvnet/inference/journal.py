@@ -122,8 +122,6 @@ def check_unchanged(place: object, changed: Sequence[str], advice: str) -> None:
     """Raise InputError if the earlier run in a place had other settings.
 
     Args:
-        place: the beginning of the message.
-        changed: the settings that have changed.
         advice: the alternative to the same settings, for the message.
     """
     if changed:

@@ -47,12 +47,7 @@ def map_drive(
     """Segment the scans of a drive, and add them to a map.
 
     Args:
-        scans: the scans.
-        drives: their poses.
-        segmenter: segments each scan.
-        builder: the map.
         saved: where the unfinished map is saved; by default, it is not saved.
-        progress: called with the number of scans that are done, and their total.
 
     Raises:
         InputError: if a scan cannot be read or segmented.

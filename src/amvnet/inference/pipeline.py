@@ -112,7 +112,6 @@ class Pipeline:
         Args:
             settings: all that the labels depend on, in JSON types; an earlier run is resumed only
                 with the same settings.
-            progress: called with the number of scans that are done, and their total.
 
         Returns:
             The entries of the scans that are done, including scans of the run that is resumed; and
@@ -287,11 +286,7 @@ class Pipeline:
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:
-    """Raise SomeBroken if some of `total` scans are broken, InputError if all are broken.
-
-    Args:
-        faults: a line for each broken scan.
-    """
+    """Raise SomeBroken if some of `total` scans are broken, InputError if all are broken."""
     if faults and len(faults) == total:
         others = len(faults) - 1
         more = f" (and {counted(others, 'other scan')} that cannot be used)" if others else ""

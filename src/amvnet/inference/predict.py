@@ -47,13 +47,8 @@ def predict(
         make_segmenter: returns the segmenter that computes the labels, with the weights, method and
             tau of the request. It is called after the inputs and the output are checked, because it
             may take long.
-        output: the files of the request, and the folder for them.
-        options: which scans of the inputs to use.
         drive: how the scores of drives are fused over time; by default, each scan is segmented
             alone.
-        batch: the number of scans that go through the networks together.
-        progress: called with the number of scans that are done, and their total.
-        report: takes lines about what was assumed of the sensor.
 
     Returns:
         The entries of the scans that are labelled, including scans of the run that is resumed; and
@@ -112,7 +107,6 @@ def report_certainty(
     """Report how sure the labels are, which recordings have doubtful labels, and what to try.
 
     Args:
-        method: the name of the method that gave the labels.
         usual: the usual share of uncertain points, in [0, 1]; None if it is not known.
     """
     points: Counter[str] = Counter()

@@ -35,7 +35,6 @@ def stream_groups(
         load: reads a scan. One other thread calls it, in the order of the records.
         compute: takes a group of records, each with the future of its scan. `at_once` other threads
             call it, or this thread if `at_once` is 1.
-        batch: the number of scans in a group.
         at_once: the number of groups that are computed at the same time, each with a share of
             torch's threads.
 
@@ -74,9 +73,6 @@ def stream_scans(
 
     Args:
         load: reads a scan in one other thread.
-        compute: takes a record and its scan.
-        at_once: the number of scans that are computed at the same time.
-        progress: called with the number of scans that are done, and their total.
 
     Yields:
         The result of each scan, in order. An exception of `load` or `compute` is raised in its

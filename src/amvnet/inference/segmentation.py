@@ -59,7 +59,6 @@ class Verdict:
         """Return the verdict on the labels of a method.
 
         Args:
-            method: the name of the method.
             share: `Segmentation.doubt` of its labels.
             usual_uncertain: the usual share of uncertain points, which only two networks have.
         """
@@ -330,7 +329,6 @@ def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> 
     Args:
         valid: (N,) bool, the scan's valid points.
         labels: (P,) train ids of all points in the batch.
-        scores: the scores of all points in the batch.
         points: the places of the scan's valid points in the batch.
     """
     return Segmentation(

@@ -64,8 +64,6 @@ def time_runs(
     """Time runs, after `WARM_UP_RUNS` that do not count; return a report for JSON.
 
     Args:
-        segmenter: runs all of AMVNet.
-        read: reads the scan.
         write: writes its (P,) train ids.
         runs: the number of runs that count, at least 1.
     """
@@ -81,8 +79,6 @@ def run_once(segmenter: Segmenter, read: Read, write: Write) -> Timing:
     """Read, segment and write a scan, with a clock around each step of `AMVNet.forward`.
 
     Args:
-        segmenter: runs all of AMVNet.
-        read: reads the scan.
         write: writes its (P,) train ids.
     """
     clock = _Clock(segmenter.device)

@@ -108,10 +108,6 @@ def check_two_networks(method: MethodName) -> None:
 def check_method(method: MethodName, parts: Collection[str]) -> MethodName:
     """Check a method, and return it.
 
-    Args:
-        method: the name of the method.
-        parts: the parts that the weights have.
-
     Raises:
         InputError: if there is no such method, or a part that it needs is missing.
     """

@@ -33,7 +33,6 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     Args:
         xyz: (P, 3), all points of the scan, metres.
         own: (U,) indices of the points whose neighbours are wanted.
-        n: number of neighbours of a point.
     """
     most = max(CROWD, n + 2)  # a point, n neighbours, and one more point, which shows a tie
     if not _may_have_crowds(xyz, most):
@@ -88,7 +87,6 @@ def _search(
     """Write R rows of `nearest`, the result of `nearest_others`, `QUERIES_AT_ONCE` at a time.
 
     Args:
-        query: the search.
         xyz: (P, 3), all points of the scan, metres.
         own: (U,) indices of the points whose neighbours are wanted.
         rows: (R,) indices of the rows to write.
@@ -107,11 +105,7 @@ def _search(
 
 
 def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
-    """Return a search for the m nearest of points (P, 3).
-
-    Raises:
-        ImportError: if pykdtree is not installed.
-    """
+    """Return a search for the m nearest of points (P, 3)."""
     from pykdtree.kdtree import KDTree
 
     tree = KDTree(xyz, leafsize=LEAF_SIZE)
@@ -148,7 +142,6 @@ def _drop_self(nearest: np.ndarray, index: np.ndarray, n: int) -> np.ndarray:
     Args:
         nearest: (U, m) indices of the nearest points of each point.
         index: (U,) indices of the points themselves.
-        n: number of neighbours to return.
     """
     if nearest.shape[1] > 1:
         if (nearest[:, 0] == index).all():  # usually, no points coincide

@@ -55,7 +55,6 @@ def nearest_others_by_blocks(xyz: Tensor, own: Tensor, n: int) -> Tensor:
     Args:
         xyz: (P, 3), all points of the scan, metres.
         own: (U,) indices of the points whose neighbours are wanted.
-        n: number of neighbours of a point.
     """
     others = min(n, len(xyz) - 1)
     if not len(own) or others < 1:
@@ -101,7 +100,6 @@ def _cut(index: Tensor, positions: Tensor, pieces: int) -> Tensor:
     Args:
         index: (M, B) indices of the points of each part.
         positions: (M, B) positions of the points along the axis.
-        pieces: number of pieces of a part.
     """
     return index.gather(1, positions.argsort(dim=1)).view(len(index) * pieces, -1)
 

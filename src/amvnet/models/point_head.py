@@ -186,7 +186,6 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
     Args:
         points: (P, 4), all points of the scan.
         index: (U,) indices of the points whose neighbours are wanted.
-        n: number of neighbours of a point.
     """
     if points.is_cuda:
         return nearest_others_by_blocks(points[:, :3], index, n)

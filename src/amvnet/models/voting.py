@@ -28,8 +28,6 @@ def vote(f: Tensor, batch: PointBatch, image: RangeImage) -> Tensor:
 
     Args:
         f: (P, K) class probabilities of the points by the range view's network.
-        batch: the points.
-        image: the range images of the batch.
     """
     distance = batch.points[:, :3].norm(dim=1)
     pixels, is_outside = image.windows(image.pixel)

@@ -87,12 +87,6 @@ def rank(
 ) -> np.ndarray:
     """Return the doubtful clusters of some labelled scans, the most doubtful cluster first.
 
-    Args:
-        dataset: the dataset that reads the scans.
-        records: the scans.
-        segmenter: scores the points by both networks.
-        progress: called with the number of scans that are done, and their total.
-
     Returns:
         (C,) rows of `ROW`.
 
@@ -240,8 +234,6 @@ def write_clusters(
 
     Args:
         clusters: (C,) rows of `ROW`, sorted.
-        records: the ranked scans.
-        taxonomy: the classes.
         path: the file, which appears whole or not at all.
     """
     names = ("", *taxonomy.classes)

@@ -55,7 +55,6 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     parts. If threads spin, the parts run one after the other.
 
     Args:
-        run: computes a part.
         parts: the arguments of `run`.
     """
     import torch

@@ -79,7 +79,6 @@ class Frame:
         """Return how far to move a scan up, metres.
 
         Args:
-            sensor: what is known about the sensor.
             usual_height: height over the ground of the sensor that the weights know, metres, or
                 None if it is unknown. If the origin lies on the ground and the height of the sensor
                 is unknown, the sensor is assumed to have this height.
@@ -161,12 +160,7 @@ def check_metres(cloud: Cloud) -> None:
 
 
 def _find_unit(xyz: np.ndarray, advice: str) -> str:
-    """Return the unit, "m" or "mm", by the distances of points (N, 3).
-
-    Raises:
-        InputError: if the distances are clearly neither metres nor millimetres; it ends in the
-            advice.
-    """
+    """Return the unit, "m" or "mm", by the distances of points (N, 3)."""
     if not len(xyz):
         return "m"
     distances = np.linalg.norm(xyz.astype(np.float64), axis=1)

@@ -200,7 +200,6 @@ class IntensityMap:
 
         Args:
             intensity: (count,) intensities in the file, or None if it has none.
-            count: number of points.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             if intensity is not None and self.scale is not None:

@@ -33,7 +33,6 @@ def lasers_by_order(points: np.ndarray, lasers: int) -> np.ndarray | None:
 
     Args:
         points: (N, 3 or more) x, y, z in metres, in the order of the file.
-        lasers: the number of lasers of the sensor.
     """
     if len(points) < MIN_POINTS * lasers:
         return None

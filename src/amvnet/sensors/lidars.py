@@ -93,11 +93,7 @@ class Sensor:
         self._check("offset", _is_triple(self.offset), "x,y,z in metres, as 0,0,1.2")
 
     def _check(self, key: str, is_valid: bool, expected: str) -> None:
-        """Check the value of an attribute.
-
-        Raises:
-            InputError: if the value is not valid.
-        """
+        """Check the value of an attribute."""
         if not is_valid:
             found = shown(getattr(self, key))
             raise InputError(f"{key}: expected {expected}, found {found}; correct the value")

@@ -214,9 +214,6 @@ def seen_scan(
     """Return a level scan with the sensor at the origin, and what was wrong with its rings.
 
     Args:
-        cloud: the points of a file.
-        frame: the frame of the file.
-        sensor: what is known about the sensor.
         usual_height: as `Frame.rises` takes it.
         intensity: (N,) intensities in [0, 1]; by default zeros.
     """
@@ -229,8 +226,6 @@ def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None
     """Return a scan in metres and in the package's axes: forward, left, up.
 
     Args:
-        cloud: the points of a file.
-        sensor: the unit and the axes of the file.
         intensity: (N,) intensities in [0, 1]; by default zeros.
     """
     xyz = sensor.to_level(cloud.xyz)

@@ -40,10 +40,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     decide it, under which the sensor saw the points before the move.
 
     Args:
-        cloud: the points of a file.
-        estimate: what was measured about the sensor.
         sensor: what is known about the sensor; it takes precedence over the estimate.
-        expected: the scans that the weights expect.
 
     Raises:
         InputError: if no point is usable.
@@ -217,11 +214,7 @@ class Normaliser:
         return dataclasses.replace(lasers, height=height)
 
     def _check_height(self, cloud: Cloud, frame: Frame) -> None:
-        """Check that the ground is not too deep for coordinates in metres.
-
-        Raises:
-            InputError: if the user gave neither height nor unit, and the ground is too deep.
-        """
+        """Check that the ground is not too deep for coordinates in metres."""
         is_known = self.sensor.height is not None or self.sensor.unit is not None
         if not is_known and frame.height is not None and frame.height > MAX_SENSOR_HEIGHT:
             raise InputError(

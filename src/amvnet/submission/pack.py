@@ -38,7 +38,6 @@ def write(
     scores or other splits, are left out. Only one scan at a time is in memory.
 
     Args:
-        rules: the rules of the benchmark's server.
         folder: folder with the predictions, under the file names of `rules`.
         out: the archive, NAME.zip. It appears whole or not at all.
         use_external: whether the method also learnt from data outside the benchmark. Only archives

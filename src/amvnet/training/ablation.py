@@ -38,8 +38,6 @@ def sweep_heads(
     Args:
         plan: how the heads are trained. Each head is kept in a folder inside the plan's folder. It
             is not trained again if it is finished.
-        models: the configurations by the value of the parameter.
-        weights: the weights with the networks that the heads are trained for.
         device: the device on which the heads are scored, such as "cpu" or "cuda".
 
     Raises:

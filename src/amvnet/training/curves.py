@@ -42,7 +42,6 @@ def read_curves(folder: Path, taxonomy: Taxonomy) -> Curves:
 
     Args:
         folder: the folder of the stage. If its files lack a metric, the curve is empty.
-        taxonomy: the classes.
     """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

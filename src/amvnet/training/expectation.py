@@ -39,12 +39,6 @@ def expected_before(
 
     If the augmentation often hides the intensities, the networks learn to do without them. A
     network that stays as it is does not.
-
-    Args:
-        known: what the weights expect that the training begins with.
-        parts: the parts of these weights.
-        recipe: the recipe of the training.
-        stages: the stages to train.
     """
     hides = recipe.training.augment.no_intensity >= BLIND_SHARE
     trained = _networks(stages)
@@ -58,14 +52,7 @@ def expected_before(
 def expected_after(
     data: TrainingData, weights: Weights, recipe: Recipe, stages: Sequence[str]
 ) -> Expectation:
-    """Return what networks expect after their training, measured on its scans.
-
-    Args:
-        data: the scans to train on.
-        weights: the weights that the training begins with.
-        recipe: the recipe of the training.
-        stages: the stages to train.
-    """
+    """Return what networks expect after their training, measured on its scans."""
     if set(NETWORK_OF.values()) & set(weights.parts) and not _networks(stages):
         return weights.expects  # a head takes what its networks take
 

@@ -102,7 +102,6 @@ def train_head(plan: Plan, weights: Weights) -> None:
     """Train the point head on scores of frozen networks, and write its weights after each epoch.
 
     Args:
-        plan: the plan of the run.
         weights: the weights of both networks, and the head's weights to begin with, if any.
 
     Raises:

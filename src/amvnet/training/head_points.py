@@ -172,12 +172,10 @@ class PointGatherer:
         labelled points instead.
 
         Args:
-            data: the scans.
             folder: the folder that receives the points. Its earlier content is removed.
             views: how many times each scan is scored, each time with another augmentation. If it is
                 0, or the scores come from other models, each scan is taken once and unchanged.
             tau: the threshold of the assertion; 0 takes the threshold of the model.
-            report: a function that prints a line about what happens.
 
         Raises:
             InputError: if the scans have too few labelled points.
@@ -237,11 +235,7 @@ class PointGatherer:
         assertion: Assertion,
         report: Reporter,
     ) -> HeadPoints:
-        """Gather the points that an assertion finds uncertain in some views of scans.
-
-        Args:
-            keys: the views: pairs of a view's number and a scan's index.
-        """
+        """Gather the uncertain points of some views (number of a view, index of a scan)."""
         processes = self.plan.processes
         if processes.first:
             shutil.rmtree(folder, ignore_errors=True)

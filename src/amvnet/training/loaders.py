@@ -176,8 +176,6 @@ def make_loader(
     """Make a loader of this process's batches. The last batch of an epoch may be smaller.
 
     Args:
-        scans: the scans to load.
-        batch: number of scans in a batch of one process.
         workers: number of processes that read scans; 0 reads them in this process.
         shuffle: whether an `EpochSampler` draws the scans of each epoch, as in training.
         processes: the processes that share the scans.

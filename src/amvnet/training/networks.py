@@ -102,7 +102,6 @@ class NetworkStage(Stage):
         """Return the pixels or voxels that the loss compares with their labels.
 
         Args:
-            batch: the valid points of some scans, their labels and their sources.
             net: the network; by default the trained one.
         """
         raise NotImplementedError
@@ -166,7 +165,6 @@ class NetworkStage(Stage):
         of an epoch may have fewer parts, and its last part may have fewer scans.
 
         Args:
-            count: number of scans in this part.
             index: index of this part in the epoch, from 0.
         """
         parts = self.trainer.accumulate_grad_batches
@@ -246,7 +244,6 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tenso
     A voxel with points of several datasets has the first of them as its source.
 
     Args:
-        view: the grids of B scans.
         scores: (M, Z * K) logits of the M pillars that have points.
         labels: (P,) train ids.
         source: (P,) index of the dataset of each point.
@@ -270,10 +267,7 @@ def train_network(plan: Plan, checked: Checked, name: str, weights: Weights) -> 
     """Train a network in the stage `rv` or `bev`, and write its weights after each epoch.
 
     Args:
-        plan: the plan of the run.
-        checked: what the check of the plan has found.
         name: the stage, "rv" or "bev".
-        weights: the weights to begin with.
 
     Raises:
         InputError: if the weights do not fit the recipe, a scan is broken, or the memory of the GPU

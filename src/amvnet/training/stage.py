@@ -223,12 +223,6 @@ class WholeCheckpoints(TorchCheckpointIO):
 def fit(stage: Stage, plan: Plan, loaders: Loaders, weights: Weights) -> None:
     """Train a stage in its folder of the run, and write its weights after each epoch.
 
-    Args:
-        stage: the stage to train.
-        plan: the plan of the run.
-        loaders: the batches to learn from and to validate with.
-        weights: the weights that the training begins with.
-
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
     """

@@ -165,9 +165,7 @@ def write_page(
     """Write one self-contained page with some scans; the file appears whole or not at all.
 
     Args:
-        path: the file, NAME.html.
         scans: the scans, in the order of the page's slider.
-        taxonomy: the classes of the labels.
 
     Returns:
         The evaluation of all labels that have a ground truth; the page shows it as a table.
@@ -255,8 +253,6 @@ def fill_page(
     """Return the text of a page with the viewer's markup, style and scripts.
 
     Args:
-        about: the values that the scripts read, for JSON.
-        scans: the HTML elements of the scans.
         replaced: the texts of scripts that replace some of `SCRIPTS`, by the name of the script.
     """
     scripts = {name: _source(name) for name in SCRIPTS} | dict(replaced or {})

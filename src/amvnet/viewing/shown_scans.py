@@ -71,7 +71,6 @@ def check_labels(labels: Path, count: int) -> None:
 
     Args:
         labels: a label file, or a folder of predictions.
-        count: the number of scans.
     """
     if not labels.exists():
         raise InputError(
@@ -92,11 +91,9 @@ def show_scans(
     """Yield scans for viewing, in order; each is read and labelled when it is needed.
 
     Args:
-        scans: the scans.
         segmenter: labels the scans; the labels of its networks are shown with its own.
         labels: without a segmenter, a folder of predictions as `predict` writes them, or the label
             file of a single scan.
-        progress: called with the number of scans that are done, and their total.
 
     Raises:
         InputError: if a file is broken or missing.
@@ -143,7 +140,6 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
 
     Args:
         result: the result of a `Segmenter`.
-        origin: the origin of the result.
     """
     scan = origin.scan
     valid = torch.from_numpy(scan.valid)

@@ -34,7 +34,6 @@ def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
     """Return the card of a weights file, without the metadata of `front_matter`.
 
     Args:
-        weights: the weights.
         name: the name by which `amvnet.load` finds the weights.
         licence: the licence that their owner grants; None if it is not known.
     """

@@ -294,9 +294,6 @@ def _read_tensors(file: Any, weights: Weights) -> dict[str, Tensor]:
     """Read the parameters of whole parts of the described model.
 
     Names, sizes and types are checked before anything is read.
-
-    Raises:
-        InputError: if the file has other parameters, or a parameter is not finite.
     """
     names = set(file.keys())
     with torch.device("meta"):  # without memory

@@ -28,7 +28,6 @@ def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
     They expect the scans of the other weights, to which the part was trained last.
 
     Args:
-        weights: the weights that keep their other parts.
         part: "range_net", "polar_net" or "point_head".
         other: the weights that have the new part.
 
@@ -71,9 +70,7 @@ def resized(weights: Weights, part: str, model: ModelConfig) -> Weights:
     The parameters stay unchanged: also replace them before you build the model.
 
     Args:
-        weights: trained weights.
         part: "range_net", "polar_net" or "point_head".
-        model: the configuration with the new sizes.
     """
     sizes = {key: getattr(model, key) for key in SIZES[part]}
     return dataclasses.replace(weights, model=dataclasses.replace(weights.model, **sizes))
@@ -95,11 +92,6 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
 
     Parameters whose size depends on the number of classes are new: the last layers, and the layers
     of the head that see the scores. All other parameters are kept.
-
-    Args:
-        weights: trained weights.
-        taxonomy: the new classes.
-        seed: the seed of the new parameters.
 
     Returns:
         The weights, without metrics, and the names of the new parameters.

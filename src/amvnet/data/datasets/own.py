@@ -260,9 +260,6 @@ class OwnScans(Dataset):
         """Return the split of each scan by the scan's name; "" if it is in none.
 
         If the file has a split without "train", the scans that it does not name are in "train".
-
-        Raises:
-            InputError: if an entry of the split matches no scan, or a scan is in two splits.
         """
         entries = []
         for split, names in self.description.split.items():

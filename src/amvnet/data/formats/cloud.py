@@ -174,7 +174,6 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
     """Return the number of points that a header claims, if it is plausible.
 
     Args:
-        count: the number that the header claims.
         path: the file, for the message and for its size.
         least: the smallest size of a file with so many points, bytes; 0 if it is not known.
 
@@ -206,7 +205,6 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
     Args:
         path: the beginning of the message.
         expected: what was expected in the file, such as "a PCD file".
-        advice: what the user can do about it.
 
     Raises:
         InputError: if the block raises anything but an interrupt or an exit.
@@ -225,7 +223,6 @@ def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str
 
     Args:
         names: the names of the file's columns, in order.
-        wanted: the possible names of each wanted column, by its key.
     """
     lower_names = list(map(str.lower, names))
 

@@ -40,11 +40,7 @@ class Fields:
         return np.dtype(fields)
 
     def read_binary(self, file: BinaryIO, count: int, chosen: dict[str, int]) -> Arrays:
-        """Read the first value of the chosen fields in at most `count` records.
-
-        Args:
-            chosen: the index of each field by the key of its column.
-        """
+        """Read the first value of the chosen fields in at most `count` records."""
         records = np.fromfile(file, self.record, count)
         return {key: records[str(index)][:, 0] for key, index in chosen.items()}
 

@@ -101,7 +101,6 @@ def list_scans(
     Args:
         path: a file, a folder or a pattern, as `find_scans` takes it.
         topic: the topic to read in bags; by default the only one with scans.
-        layout: the names of the columns in files that do not name them.
         is_alone: whether the user names no other path.
 
     Raises:

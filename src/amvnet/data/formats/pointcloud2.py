@@ -29,7 +29,6 @@ def read_message(message: Any, name: str) -> Cloud:
 
     Args:
         message: any object with the attributes of PointCloud2.
-        name: the source of the scan, for messages.
 
     Raises:
         InputError: if x, y or z is missing, or the data are shorter than the message claims.

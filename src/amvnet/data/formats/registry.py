@@ -55,7 +55,6 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
 
     Args:
         ending: the ending of its format (`ending_of`).
-        layout: the names of the columns in files that do not name them.
 
     Raises:
         InputError: if the file is broken, or needs a package that is missing.
@@ -73,7 +72,6 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
 
     Args:
         ending: the ending of its format, one of `COLUMN_READERS`.
-        wanted: the possible names of each column, by its key.
 
     Raises:
         InputError: if the file is broken, lacks a column, or needs a package that is missing.
@@ -111,7 +109,6 @@ def check_packages(place: object, ending: str) -> None:
 
     Args:
         place: the beginning of the message.
-        ending: the ending of the format.
     """
     missing = [package for package in PACKAGES.get(ending, ()) if find_spec(package) is None]
     if missing:

@@ -123,7 +123,6 @@ def named_cloud(
         columns: the columns, (N,) each.
         names: the names of the columns; more columns than names are left out.
         name: the source of the scan, for messages.
-        note: what was assumed about the file.
 
     Raises:
         InputError: if there are fewer columns than names, or a column does not hold numbers.

@@ -22,7 +22,6 @@ def write_cloud(path: Path, ending: str, columns: Columns, program: str = "amvne
     """Write points in the format of an ending.
 
     Args:
-        path: the file.
         ending: .ply, .pcd, .las or .laz.
         columns: (N,) x, y and z in metres; red, green and blue, uint8; class, int32; and any
             others. LAS has coordinates in millimetres, lost points (NaN) at 0, 0, 0 (in map

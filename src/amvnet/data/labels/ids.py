@@ -23,8 +23,6 @@ def read_ids(path: Path, dtype: DTypeLike, count: int) -> np.ndarray:
     """Read the (N,) raw ids of one scan.
 
     Args:
-        path: the file.
-        dtype: the type of the ids in the file.
         count: N, the number of points.
 
     Raises:
@@ -81,8 +79,6 @@ def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> Non
     Args:
         name: the beginning of the message.
         size: the size of the file, bytes.
-        count: the number of points.
-        dtype: the type of the labels.
 
     Raises:
         InputError: if the file cannot hold `count` labels of `dtype`.
@@ -113,7 +109,6 @@ def train_ids(
     Args:
         name: the beginning of the message.
         raw: (N,) raw ids.
-        taxonomy: the classes.
         advice: as `Taxonomy.to_train` takes it.
 
     Raises:

@@ -67,7 +67,6 @@ def read_raw_labels(
         count: N, the number of points of the scan.
         field: the name of the column. In `.npz`, it may also name an array next to the points. In
             arrays and text without names, it is the number of the column, from 0.
-        layout: the names of the columns in files that do not name them.
         missing: the raw id for NaN, which CloudCompare writes for points without a label.
 
     Raises:

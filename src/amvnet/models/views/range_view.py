@@ -168,7 +168,6 @@ class RangeView:
         """Return the rows (P,) that `RangeViewConfig.rows` asks for.
 
         Args:
-            batch: the batch of scans.
             which: (P,) bool: the points whose rows are needed; by default all points.
         """
         if self.config.rows == "ring":
@@ -232,7 +231,6 @@ def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tens
     Args:
         distance: (P,) distance of each point, metres.
         pixel: (P,) pixel of each point.
-        pixels: number of pixels.
         least: smallest distance of a point that counts, metres.
     """
     # The bits of floats >= 0 have the order of the floats. So if integers hold a distance in their
