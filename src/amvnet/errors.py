@@ -32,11 +32,7 @@ def shown(value: object) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") -> str:
-    """Return the end of an error message: the most similar known name, or else the advice.
-
-    Args:
-        advice: what the user should do if no name is similar.
-    """
+    """Return the end of an error message: the most similar known name, or else the advice."""
     names = {name.lower(): name for name in known}
     longest = 2 * max(map(len, names), default=0)  # no longer word is similar to a name
     similar = difflib.get_close_matches(word[:longest].lower(), names, n=1)
@@ -146,10 +142,7 @@ NO_MEMORY = re.compile(
 
 @contextmanager
 def memory_for(content: str) -> Iterator[None]:
-    """Turn an error for lack of memory into an `InputError`.
-
-    Args:
-        content: the content that needs the memory, such as the name of a scan.
+    """Turn an error for lack of memory into an `InputError` that begins with `content`.
 
     Raises:
         InputError: if there is no memory left for the block.

@@ -102,10 +102,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 
 
 def publish(part: Path, path: Path) -> None:
-    """Write a finished file to the disk, and then rename it from `part` to `path`.
-
-    Both paths are in the same file system.
-    """
+    """Write a finished file to the disk, and rename it to `path` in the same file system."""
     with part.open("rb+") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
@@ -245,11 +242,7 @@ def fault_of_name(name: Path) -> str | None:
 
 
 def checked_token(text: object) -> str:
-    """Return a token that is to be the name of a file.
-
-    Raises:
-        InputError: if it is not a plain name.
-    """
+    """Return a token that is to be the name of a file; raise InputError if it is no plain name."""
     if (
         not isinstance(text, str)
         or not text.isprintable()

@@ -87,11 +87,7 @@ def check_outputs(
 
 
 def check_not_read(outputs: Iterable[Path], inputs: Iterable[Path | str | None]) -> None:
-    """Check that no output is a file that the command reads, under any name or link.
-
-    Raises:
-        InputError: if an output is such a file.
-    """
+    """Raise InputError if an output is a file that the command reads, under any name or link."""
     existing = [path for path in outputs if os.path.lexists(path)]
     if not existing:
         return

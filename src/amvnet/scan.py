@@ -83,11 +83,7 @@ class Scan:
         return f"<{title}: {', '.join(parts)}>"
 
     def select(self, which: np.ndarray) -> Scan:
-        """Return the scan with some of the points.
-
-        Args:
-            which: (N,) bool, or (M,) indices.
-        """
+        """Return the scan with some of the points: (N,) bool, or (M,) indices."""
         return replace(
             self,
             points=self.points[which],

@@ -168,11 +168,7 @@ class ProgressLines:
             report(f"{self.title}: {done} of {total}, {pace}")
 
     def _pace(self, done: int, total: int, elapsed: float) -> str:
-        """Return the rate and the time left, such as "2.1 a second, 0:01:16 left".
-
-        Args:
-            elapsed: time since the start, seconds.
-        """
+        """Return the rate and the time left after some seconds: "2.1 a second, 0:01:16 left"."""
         rate = done / elapsed
         pace = f"{rate:.3g} a second" if rate >= 1 else f"{1 / rate:.3g} s each"
         left = timedelta(seconds=round((total - done) / rate))

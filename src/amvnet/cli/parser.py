@@ -208,11 +208,7 @@ def make_parser(command: str, run: Callable[..., None]) -> Parser:
 
 
 def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
-    """Run a command with the values of its options.
-
-    Args:
-        values: the values by the name of the argument or option.
-    """
+    """Run a command with the values of its arguments and options by name."""
     hints = get_type_hints(run)
     arguments = []
     for name in inspect.signature(run).parameters:

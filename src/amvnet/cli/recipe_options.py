@@ -18,11 +18,7 @@ HELP_ALL = "--help-all"
 
 
 def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
-    """Add the values of a recipe as options.
-
-    Args:
-        shows_all: whether the help shows these options.
-    """
+    """Add the values of a recipe as options, which the help shows if `shows_all`."""
     parser.add_argument(
         HELP_ALL,
         action="help",
@@ -49,10 +45,7 @@ def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
 
 
 def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
-    """Return a recipe whose values are replaced by the options that have dots in their names.
-
-    Args:
-        values: the texts of all options by name; None for an option that is not given.
+    """Return a recipe with the texts of options that have dots in their names and are not None.
 
     Raises:
         InputError: if a value has the wrong type or is out of its range, or the recipe takes the

@@ -68,11 +68,7 @@ class Stop:
 
 @contextmanager
 def stoppable(line: str, exits: bool) -> Iterator[Stop]:
-    """Yield a `Stop`, which raises KeyboardInterrupt in the block at SIGINT or SIGTERM.
-
-    Args:
-        exits: whether this process belongs to the command line.
-    """
+    """Yield a `Stop`, which raises KeyboardInterrupt in the block at SIGINT or SIGTERM."""
     stop = Stop(line, exits)
     earlier = {}
     if threading.current_thread() is threading.main_thread():

@@ -24,12 +24,9 @@ from amvnet.weights.file import built_in, load
 
 
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
-    """Return the table of an evaluation, with a row for each class and a column for each method.
+    """Return the table of a report of `Evaluation`: a row for each class, a column for each method.
 
     The overall figures and the mIoU by distance follow below the classes.
-
-    Args:
-        report: the result of `Evaluation.report`.
     """
     methods = report["methods"]
     figures = list(methods.values())

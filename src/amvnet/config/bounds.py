@@ -90,11 +90,7 @@ def _check_range(name: str, value: Any, kind: Any) -> None:
 
 
 def check_text(name: str, value: Any) -> None:
-    """Check that a value of a file is a short text of one line.
-
-    Raises:
-        InputError: if it is not.
-    """
+    """Raise InputError if a value of a file is not a short text of one line."""
     if not isinstance(value, str) or not value.isprintable() or len(value) > MAX_TEXT_LENGTH:
         raise InputError(
             f"{name}: expected a text of at most {MAX_TEXT_LENGTH} printable characters, "

@@ -80,11 +80,7 @@ def flat(tree: Any, name: str = "", depth: int = MAX_DEPTH) -> Iterator[tuple[st
 
 
 def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
-    """Return a copy of a dataclass with the values of nested dictionaries; see `from_dict`.
-
-    Raises:
-        InputError: if `from_dict` raises it.
-    """
+    """Return a copy of a dataclass with the values of nested dictionaries; see `from_dict`."""
     field_types = get_type_hints(type(default))
 
     changes = {}

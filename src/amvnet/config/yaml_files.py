@@ -18,10 +18,7 @@ NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")  # PyYAML's tags 
 def read_yaml(path: Path, content: str) -> Any:
     """Return the content of a YAML file: dictionaries, lists, texts and numbers.
 
-    Nothing in the file is executed.
-
-    Args:
-        content: the expected content, for messages, such as "a label map".
+    Nothing in the file is executed. Messages name the expected content, such as "a label map".
 
     Raises:
         InputError: if the file cannot be read, is too large, or is not YAML.

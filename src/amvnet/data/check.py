@@ -331,11 +331,7 @@ def _read_all(
 
 
 def _contents_of(dataset: Dataset, record: ScanRecord, is_ground: np.ndarray) -> Contents:
-    """Read a scan and its labels; raise InputError if it cannot be trained on.
-
-    Args:
-        is_ground: (K + 1,) bool, whether each train id is of the ground.
-    """
+    """Read a scan and its labels, given which (K + 1,) train ids are of the ground."""
     scan = dataset.read_unchanged(record)
     raw = dataset.raw_labels(record, len(scan)).astype(np.int64) & INSTANCE_MASK
     labels = dataset.train_ids_by_raw()[raw]

@@ -108,11 +108,7 @@ def _over_lowest(xyz: np.ndarray) -> np.ndarray:
 
 
 def _grouped(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the order that joins points of one cell, and whether each is the first of its cell.
-
-    Args:
-        cells: (N, 2 or 3) int64 indices.
-    """
+    """Return the order that joins points of one cell (N, 2 or 3), and which points begin a cell."""
     key = np.zeros(len(cells), dtype=np.int64)
     for axis in cells.T:
         key = key * 100_003 + axis  # wraps around; two cells share a key only by rare chance
@@ -134,23 +130,14 @@ def scattered_classes(counts: np.ndarray, taxonomy: Taxonomy) -> Iterator[str]:
 
 
 def raised_classes(counts: np.ndarray, points: np.ndarray, taxonomy: Taxonomy) -> Iterator[str]:
-    """Yield the classes of the ground with many raised points, with their share.
-
-    Args:
-        counts: (K + 1,) counts of `raised`.
-        points: (K + 1,) points by train id.
-    """
+    """Yield the classes with many `raised` ones of their (K + 1,) points, and the share."""
     shares = counts / np.maximum(points, 1)
     for train_id in np.flatnonzero((shares > MAX_RAISED) & (points >= MIN_NEIGHBOURS)):
         yield f"{taxonomy.names[train_id]} ({shares[train_id]:.0%})"
 
 
 def frequent_classes(points: np.ndarray, taxonomy: Taxonomy) -> Iterator[str]:
-    """Yield the classes with more points than on any street, with their share.
-
-    Args:
-        points: (K + 1,) points by train id.
-    """
+    """Yield the classes with more of the (K + 1,) points than on any street, with their share."""
     shares = points / max(points.sum(), 1)
     for train_id, coarse in enumerate(coarse_names(taxonomy)):
         if shares[train_id] > MAX_SHARES.get(coarse, 1):

@@ -212,11 +212,7 @@ def check_classes(source: str, of_data: Taxonomy, of_weights: Taxonomy) -> None:
 
 
 def describe_difference(classes: Sequence[str], others: Sequence[str], of_others: str) -> str:
-    """Describe how some classes differ from others, by their names.
-
-    Args:
-        of_others: what has the other classes, such as "the weights".
-    """
+    """Describe how the names of classes differ from those of others, such as "the weights"."""
     missing = [name for name in classes if name not in others]
     added = [name for name in others if name not in classes]
     texts = []
@@ -282,15 +278,7 @@ def user_taxonomy(
     raw_to_train: Mapping[int | str, int],
     train_to_raw: Sequence[int],
 ) -> Taxonomy:
-    """Return the taxonomy of a user's classes.
-
-    Args:
-        entries: the classes, as `class_entries` returned them.
-        raw_to_train, train_to_raw: as in `Taxonomy`.
-
-    Raises:
-        InputError: if `Taxonomy` raises it.
-    """
+    """Return the taxonomy of a user's classes, given what `class_entries` and `Taxonomy` hold."""
     return Taxonomy(
         name=f"own-{name}" if name in TAXONOMIES else name,
         classes=tuple(entries),

@@ -45,11 +45,6 @@ class OnnxEngine(Engine):
     It computes on a GPU if the installed ONNX Runtime can. GPUs cannot run graphs in int8, whose
     activations are unsigned.
 
-    Args:
-        method: how the points are scored, one of `METHODS`.
-        tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
-        int8: whether the graphs are in int8.
-
     Raises:
         InputError: if the weights lack a part that the method needs, there is no such method, or
             tau is out of range.
@@ -148,10 +143,7 @@ class OnnxGraph(nn.Module):
 
 
 def _provider_options(name: str, cache: Path | None) -> dict[str, Any]:
-    """Return the options of a provider.
-
-    TensorRT builds its engine once, in minutes, and keeps it in the cache.
-    """
+    """Return a provider's options. TensorRT builds its engine in minutes, and keeps it."""
     if name != TENSORRT or cache is None:
         return {}
     return {"trt_engine_cache_enable": True, "trt_engine_cache_path": str(cache)}

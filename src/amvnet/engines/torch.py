@@ -20,17 +20,8 @@ from amvnet.weights.file import Weights
 class TorchEngine(Engine):
     """Runs the two networks in PyTorch; `Engine` documents the attributes.
 
-    Args:
-        weights: trained weights.
-        method: how the points are scored, one of `METHODS`.
-        tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
-        device: "cpu", "cuda", "cuda:1", ..., or "auto", which is "cuda" if there is a GPU, else
-            "cpu".
-        precision: the precision of the two networks: "float32", "bfloat16", "float16" on a GPU, or
-            "auto", which is bfloat16 on a GPU that has it, else float32. The projections compute in
-            float64, everything else in float32.
-        graphs: on a GPU, capture the networks as CUDA graphs (`engines.graphs`), once for each
-            number of scans in a batch.
+    `amvnet.load` documents the arguments. With `graphs`, the networks are captured as CUDA graphs
+    (`engines.graphs`), once for each number of scans in a batch.
 
     Raises:
         InputError: if the weights lack a part that the method needs, there is no such method,

@@ -38,11 +38,7 @@ TABLES = ("classes", "methods")  # the tables of `write_all` that have no figure
 
 
 def files_of(out: Path, figures: Sequence[str], tables: Sequence[str]) -> dict[Path, Signature]:
-    """Return the files of some figures, their tables, and some other tables in a folder.
-
-    Args:
-        tables: names of tables without a figure.
-    """
+    """Return the files of some figures, of their tables, and of some other tables in a folder."""
     files = {out / f"{name}.csv": TABLE for name in (*figures, *tables)}
     return files | {out / f"{name}.png": PICTURE for name in figures}
 
@@ -63,9 +59,7 @@ def write_sweep(
 ) -> list[Path]:
     """Write Figure 8 of the paper: mIoU and share of uncertain points; return the files.
 
-    Args:
-        used: the value of the parameter in the weights.
-        path: the path of the files to write, without an ending.
+    `used` is the value of the parameter in the weights; `path` has no ending.
     """
     values, shares, mious, _ = zip(*rows, strict=True)
 
@@ -88,10 +82,8 @@ def write_sweep(
 def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path) -> list[Path]:
     """Write Table 5 of the paper, the ablation of the range-view network; return the files.
 
-    Args:
-        rows: for each network, whether it has the GRU, whether it was trained with class weights,
-            and its metrics.
-        path: the path of the files to write, without an ending.
+    A row says whether the network has the GRU and whether it was trained with class weights, and
+    has its metrics. The path has no ending.
     """
     table: list[Sequence[Cell]] = []
     for gru, weighted, network_metrics in rows:

@@ -177,11 +177,7 @@ def stream_labelled(
     at_once: int,
     progress: Progress,
 ) -> Iterator[Result]:
-    """Yield results as `stream_scans` does.
-
-    Raises:
-        InputError: if a scan cannot be read, or has no true labels.
-    """
+    """Yield results as `stream_scans` does; raise InputError if a scan has no true labels."""
 
     def read(record: ScanRecord) -> Scan:
         scan = dataset.read(record)

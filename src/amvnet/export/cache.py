@@ -40,14 +40,7 @@ def cached_networks(
     The files are compared with the digests in their description. If a file differs or is missing,
     the networks are exported again. A cache that another user can write is not used, and a cache
     that cannot be written is not filled: the networks are exported for this process alone. Several
-    processes may use the cache at the same time.
-
-    Args:
-        int8: the scans for the calibration, as `export` takes them; by default, the graphs are in
-            float32.
-
-    Raises:
-        InputError: if `export` raises it.
+    processes may use the cache at the same time. `export` documents `int8` and the errors.
     """
     check_libraries()
     exported = "exported" if int8 is None else "exported and calibrated in int8"

@@ -174,11 +174,7 @@ class LabelScans:
 
 
 class MeasureSensors:
-    """A class for `map_batches` that measures the sensors of drives on their first scans.
-
-    Args:
-        request: how the scans are labelled.
-    """
+    """A class for `map_batches` that measures the sensors of drives on their first scans."""
 
     def __init__(self, request: LabellingRequest) -> None:
         self.request = request

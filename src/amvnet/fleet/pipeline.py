@@ -338,12 +338,7 @@ class FleetRun:
 
 
 class Worker:
-    """An actor of Ray Data.
-
-    Args:
-        kind: the class that does the work.
-        arguments: a reference to the arguments of the class, which Ray copies to each machine once.
-    """
+    """An actor of Ray Data, whose `arguments` Ray copies to each machine once."""
 
     def __init__(self, kind: type[LabelScans] | type[MeasureSensors], arguments: Any) -> None:
         self.work = kind(*ray.get(arguments))
@@ -368,10 +363,7 @@ def _with_estimates(scans: pa.Table, estimates: dict[str, str]) -> pa.Table:
 
 
 def connect(address: str | None = None) -> None:
-    """Connect this process to a Ray cluster, unless it is already connected.
-
-    Args:
-        address: the address, as in `Cluster`.
+    """Connect this process to the cluster of an address (`Cluster`), unless it is connected.
 
     Raises:
         InputError: if the text is not an address, or no cluster has it.

@@ -125,10 +125,7 @@ class Place:
                 yield from (self / name).walk(f"{prefix}{name}/")
 
     def fetch(self, folder: Path) -> Path:
-        """Return the path of a file on this machine, or of a copy of a file in object storage.
-
-        Args:
-            folder: the folder for the copy; it is made if it is missing.
+        """Return the path of a file on this machine, or of its copy in a folder, which is made.
 
         Raises:
             InputError: if the file cannot be read.

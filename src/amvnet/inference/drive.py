@@ -103,11 +103,7 @@ class Drives:
         return needed
 
     def fuse(self, outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
-        """Yield the outcomes of scans with the consensus of their drive as labels and scores.
-
-        Args:
-            outcomes: the scans of each drive in order. Broken scans are left out of the consensus.
-        """
+        """Yield outcomes, in the order of each drive, with the consensus as labels and scores."""
         broken = deque[Outcome]()
         for (scan, loaded, result), scores, _ in self.consensus_of(outcomes, broken):
             while broken:
@@ -119,11 +115,9 @@ class Drives:
     def consensus_of(
         self, outcomes: Iterable[Outcome], broken: deque[Outcome] | None = None
     ) -> Iterator[Fused[Outcome]]:
-        """Yield the consensus on the scans of each drive.
+        """Yield the consensus on the scans of each drive, which are in order.
 
-        Args:
-            outcomes: the scans of each drive in order.
-            broken: gets the scans that are broken, which are left out.
+        `broken` gets the scans that are broken; they are left out.
         """
         aside = deque[Outcome]() if broken is None else broken
         for _, drive in groupby(outcomes, key=lambda outcome: outcome[0].source):
@@ -194,11 +188,7 @@ def drive(
 def with_scores(
     result: Segmentation, scores: NDArray[np.float32], table: NDArray[np.uint8] | None = None
 ) -> Segmentation:
-    """Return a result with other scores (N, K) and the labels that follow from them.
-
-    Args:
-        table: maps the labels to other classes; without it, they stay unchanged.
-    """
+    """Return a result with other scores (N, K), and their labels, mapped by a table if given."""
     labels = np.where(result.labels > 0, scores.argmax(axis=1) + 1, 0).astype(np.uint8)
     return replace(result, scores=scores, labels=labels if table is None else table[labels])
 

@@ -155,9 +155,7 @@ def fuse_files(
 
     Args:
         inputs: the scans, as `list_inputs` takes them.
-        head: weights with a point head. Without them, the labels are the ensemble's.
-        tau: the threshold of the assertion, in [0, 1]; by default the threshold of the head's
-            weights, or of the paper without a head.
+        head, tau: as for `fuse`; the head is that of weights.
         taxonomy: the classes if there is no head; by default the classes of the inputs.
 
     Raises:

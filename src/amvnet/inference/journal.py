@@ -119,11 +119,7 @@ def changed_settings(settings: Mapping[str, Any], earlier: Mapping[str, Any]) ->
 
 
 def check_unchanged(place: object, changed: Sequence[str], advice: str) -> None:
-    """Raise InputError if the earlier run in a place had other settings.
-
-    Args:
-        advice: the alternative to the same settings, for the message.
-    """
+    """Raise InputError if the earlier run in a place had other settings, which `changed` lists."""
     if changed:
         raise InputError(
             f"{place}: expected the settings of the earlier run, found other values of "

@@ -44,10 +44,7 @@ def map_drive(
     saved: SavedMap | None = None,
     progress: Progress = no_progress,
 ) -> None:
-    """Segment the scans of a drive, and add them to a map.
-
-    Args:
-        saved: where the unfinished map is saved; by default, it is not saved.
+    """Segment the scans of a drive, and add them to a map, which `saved` keeps while unfinished.
 
     Raises:
         InputError: if a scan cannot be read or segmented.

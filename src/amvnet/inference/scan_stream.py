@@ -71,12 +71,7 @@ def stream_scans(
 ) -> Generator[Result]:
     """Read scans and compute on each, as `stream_groups` does for groups of one scan.
 
-    Args:
-        load: reads a scan in one other thread.
-
-    Yields:
-        The result of each scan, in order. An exception of `load` or `compute` is raised in its
-        turn.
+    One other thread calls `load`. An exception of `load` or `compute` is raised in its turn.
     """
 
     def compute_one(group: Sequence[tuple[Record, Future[Loaded]]]) -> Result:

@@ -56,12 +56,7 @@ class Verdict:
 
     @classmethod
     def of(cls, method: str, share: float, usual_uncertain: float | None) -> Verdict:
-        """Return the verdict on the labels of a method.
-
-        Args:
-            share: `Segmentation.doubt` of its labels.
-            usual_uncertain: the usual share of uncertain points, which only two networks have.
-        """
+        """Return the verdict on a method's labels, given their `doubt` and its usual value."""
         if METHODS[method].has_two_networks:
             return Verdict(share, usual_uncertain)
         return EntropyVerdict(share, USUAL_ENTROPY[METHODS[method].parts[0]])
@@ -291,11 +286,7 @@ class Segmentation:
         )
 
     def require_origin(self) -> Origin:
-        """Return the origin.
-
-        Raises:
-            InputError: if there is none.
-        """
+        """Return the origin; raise InputError if there is none."""
         if self.origin is None:
             raise InputError(
                 "expected the result of a Segmenter, which knows its classes and points, "

@@ -63,9 +63,7 @@ def time_runs(
 ) -> dict[str, Any]:
     """Time runs, after `WARM_UP_RUNS` that do not count; return a report for JSON.
 
-    Args:
-        write: writes its (P,) train ids.
-        runs: the number of runs that count, at least 1.
+    Each run reads a scan, segments it, and writes its (P,) train ids.
     """
     timings = []
     for run in range(runs + WARM_UP_RUNS):
@@ -76,11 +74,7 @@ def time_runs(
 
 @torch.inference_mode()
 def run_once(segmenter: Segmenter, read: Read, write: Write) -> Timing:
-    """Read, segment and write a scan, with a clock around each step of `AMVNet.forward`.
-
-    Args:
-        write: writes its (P,) train ids.
-    """
+    """Read, segment and write a scan, with a clock around each step of `AMVNet.forward`."""
     clock = _Clock(segmenter.device)
     start = time.perf_counter()
     with clock("read"):

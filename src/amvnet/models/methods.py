@@ -94,11 +94,7 @@ def methods_of(
 
 
 def check_two_networks(method: MethodName) -> None:
-    """Check that a method has two networks, so that it knows uncertain points.
-
-    Raises:
-        InputError: if it has one network.
-    """
+    """Raise InputError if a method has one network, so that it knows no uncertain points."""
     if not METHODS[method].has_two_networks:
         raise InputError(
             f"expected a method of two networks for --uncertain, found {method}; use amvnet"

@@ -153,11 +153,7 @@ def is_constant(quantiles: np.ndarray | Sequence[float]) -> bool:
 
 
 def are_of_one_range(a: np.ndarray | None, b: np.ndarray | None) -> bool:
-    """Return whether the intensities of two scans have one range.
-
-    Args:
-        a, b: the quantiles of each scan at `PROBABILITIES`, or None if it has no intensities.
-    """
+    """Return whether intensities with these quantiles (None: no intensities) have one range."""
     if a is None or b is None:
         return a is None and b is None
     if is_constant(a) or is_constant(b):

@@ -107,9 +107,7 @@ def order_rings(scan: Scan) -> tuple[Scan, str]:
 def _elevations_of_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the mean elevation of each ring, degrees, and whether each ring has one elevation.
 
-    Args:
-        xyz: (P, 3) float64 coordinates, none of them on the z axis.
-        ring: (P,) ring indices, 0 or above; means of other rings are 0.
+    The points are (P, 3) float64, none on the z axis; the means of rings below 0 are 0.
     """
 
     def means_of(values: np.ndarray) -> np.ndarray:

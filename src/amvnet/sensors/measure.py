@@ -120,11 +120,7 @@ class Recording:
         self._is_learnt = bool(self._first)
 
     def estimate(self, cloud: Cloud) -> tuple[Estimate, bool]:
-        """Return what to assume about a scan, and whether its sensor is the usual sensor.
-
-        Raises:
-            InputError: if `find_frame` raises it.
-        """
+        """Return what to assume about a scan, and whether its sensor is the usual sensor."""
         if self._is_learnt and self.usual is not None and self.usual.is_steady:
             if self._recognises(cloud, self.usual):
                 return self.usual, True
@@ -223,11 +219,7 @@ def seen_scan(
 
 
 def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:
-    """Return a scan in metres and in the package's axes: forward, left, up.
-
-    Args:
-        intensity: (N,) intensities in [0, 1]; by default zeros.
-    """
+    """Return a scan in metres and in the package's axes, with intensities (N,) or zeros."""
     xyz = sensor.to_level(cloud.xyz)
     return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 

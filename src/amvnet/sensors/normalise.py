@@ -376,10 +376,7 @@ def _describe_missing(cloud: Cloud) -> str:
 
 
 def _describe_negative(cloud: Cloud) -> str:
-    """Return in words how many points have an intensity below 0, which counts as 0.
-
-    Return an empty text if no point has.
-    """
+    """Return how many points have an intensity below 0, which counts as 0; empty for none."""
     measured = cloud.measured_intensity()
     if measured is None or measured.min() >= 0 or measured.max() < 0:
         return ""

@@ -103,13 +103,10 @@ def mix_lasers(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
 
 
 def paste(scan: Scan, other: Scan, classes: Sequence[int], rng: np.random.Generator) -> Scan:
-    """Add the points of some classes of another scan (Xiao et al., 2022).
+    """Add the points of some classes (train ids) of another scan (Xiao et al., 2022).
 
     The points are added at their place, and once or twice more after a rotation by a random yaw.
     Points behind them stay in the scan.
-
-    Args:
-        classes: train ids of the classes.
     """
     assert other.labels is not None
     objects = other.select(np.isin(other.labels, classes) & other.valid)

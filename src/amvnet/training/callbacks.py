@@ -175,11 +175,8 @@ class SeedBatches(Callback):
 class EpochLines(Callback):
     """Reports a line for each epoch. It is used if there is no terminal for a progress bar.
 
-    Args:
-        report: a function that prints a line.
-        name: the name of the stage.
-        later: the number of epochs in the later stages. The estimate of the whole time left assumes
-            that each of them takes as long as an epoch of this stage.
+    `later` is the number of epochs in the later stages. The estimate of the whole time left assumes
+    that each of them takes as long as an epoch of this stage.
     """
 
     def __init__(self, report: Reporter, name: str, later: int = 0) -> None:

@@ -28,13 +28,8 @@ VAL_FACTOR = 64  # size of a validation batch, in training batches
 class HeadStage(Stage):
     """Stage `head`. It learns from scores that were gathered beforehand by frozen networks.
 
-    It always computes in float32: it is so small that a lower precision would save nothing.
-
-    Args:
-        head: the point head.
-        train: the points to learn from.
-        val: the points to validate with, or None to validate nothing.
-        shared: the arguments of `Stage`.
+    It always computes in float32: it is so small that a lower precision would save nothing. Without
+    `val`, nothing is validated.
     """
 
     name = "head"

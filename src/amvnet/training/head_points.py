@@ -348,16 +348,9 @@ def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
 
 
 def _ensemble_matrices(f: Tensor, g: Tensor, labels: Tensor, uncertain: Tensor) -> np.ndarray:
-    """Return two confusion matrices of the ensemble, over the certain and the uncertain points.
+    """Return (2, K + 1, K + 1) int64 confusion matrices of the ensemble of f and g (P, K).
 
-    Args:
-        f: (P, K) probabilities of the range view.
-        g: (P, K) probabilities of the bird's-eye view.
-        labels: (P,) train ids.
-        uncertain: (P,) bool.
-
-    Returns:
-        (2, K + 1, K + 1) int64.
+    The first is over the certain points, the second over the uncertain ones.
     """
     prediction = (geometric_mean(f, g).argmax(dim=1) + 1).cpu().numpy()
     truth = labels.cpu().numpy()

@@ -233,18 +233,12 @@ def dice(probabilities: Tensor, targets: Targets) -> Tensor:
 
 
 def lovasz_softmax(probabilities: Tensor, targets: Targets) -> Tensor:
-    """Return the Lovász extension of the Jaccard loss, averaged over the classes present.
+    """Return the Lovász extension of the Jaccard loss: the mean over the classes present and scans.
 
-    For each class, the errors |t - p| are sorted, largest first. Each error is weighted by the
-    increase of the Jaccard loss when its point joins the mispredicted points (Berman et al., CVPR
-    2018). Errors up to `MIN_ERROR` are left out, which saves most of the sorting.
-
-    Args:
-        probabilities: p, (P, K).
-        targets: the labels; t is 1 for the points of the class, else 0.
-
-    Returns:
-        The mean over the scans, a scalar.
+    For each class, the errors |t - p| are sorted, largest first, where t is 1 for the points of the
+    class, else 0. Each error is weighted by the increase of the Jaccard loss when its point joins
+    the mispredicted points (Berman et al., CVPR 2018). Errors up to `MIN_ERROR` are left out, which
+    saves most of the sorting.
     """
     classes = probabilities.shape[1]
     with torch.no_grad():  # the order and the increases have no gradient

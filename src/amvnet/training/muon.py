@@ -26,12 +26,8 @@ class Muon(torch.optim.Optimizer):
     A few directions dominate the gradient of a kernel, so that a network learns the others slowly.
     A step of Muon is as long in every direction: the singular values of the averaged gradient, as a
     matrix with a row for each output channel, are replaced by 1.
-    `torch.optim.Muon` takes only matrices, and needs torch 2.9.
-
-    Args:
-        net: the network, whose parameters are in the order of its layers.
-        lr: the learning rate of all parameters.
-        weight_decay: the decoupled weight decay of all parameters.
+    `torch.optim.Muon` takes only matrices, and needs torch 2.9. The network's parameters are in the
+    order of its layers.
     """
 
     def __init__(self, net: nn.Module, lr: float, weight_decay: float) -> None:

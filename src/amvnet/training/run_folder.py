@@ -204,11 +204,7 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
 
 
 def stage_record(plan: Plan, settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of a stage's training, which is stored in its weights.
-
-    Args:
-        settings: the settings of the stage, as `stage_settings` returns them.
-    """
+    """Return the record of a stage's training by some `stage_settings`; its weights store it."""
     scores = {"scores": settings["scores"]} if "scores" in settings else {}
     return {
         **settings["training"],

@@ -63,12 +63,8 @@ Loaders = tuple[DataLoader[Any], DataLoader[Any] | None]
 class Stage(L.LightningModule):
     """The base class of all stages: it computes the metrics of the validation, and the schedule.
 
-    Args:
-        config: the values of the stage in the recipe.
-        taxonomy: the K classes.
-        processes: the processes that share the run.
-        report: a function that prints a line about what happens.
-        precision: the precision of the forward and backward passes.
+    `config` has the values of the stage in the recipe; `precision` is that of the forward and
+    backward passes.
     """
 
     name: str  # the value of --stage
@@ -135,12 +131,8 @@ class Stage(L.LightningModule):
     def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
         """Return an optimizer with the one-cycle schedule, as Lightning expects it.
 
-        The learning rate rises to its peak, may stay there, and falls again. The momentum does the
-        opposite.
-
-        Args:
-            optimizer: the optimizer: SGD, AdamW or Muon.
-            momentum: the highest momentum of SGD, or the highest first beta of the others.
+        The learning rate rises to its peak, may stay there, and falls again. The momentum, of which
+        `momentum` is the highest (SGD) or the highest first beta (others), does the opposite.
         """
         # The schedule needs two steps before its peak, but a very short training has fewer.
         least = math.ceil(2 / self.config.warmup)

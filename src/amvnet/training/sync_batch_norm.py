@@ -13,10 +13,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
     """Replace the batch norms inside a network by batch norms over the batches of all processes.
 
-    The network is changed in place and returned.
-
-    Args:
-        cuda: whether to use PyTorch's `SyncBatchNorm`, which runs on GPUs only.
+    The network is changed in place and returned. On GPUs, PyTorch's `SyncBatchNorm` is used.
     """
     if cuda:
         synchronised: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(net)

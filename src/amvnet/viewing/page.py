@@ -136,10 +136,7 @@ def page_name(path: Path | str) -> Path:
 
 @contextmanager
 def place_for_page(path: Path | None) -> Iterator[Path]:
-    """Yield the path, or else a path in a new temporary folder.
-
-    The temporary folder stays if the page is written in the block.
-    """
+    """Yield the path, or a path in a new temporary folder, which stays if the page is written."""
     if path is not None:
         yield path
         return
@@ -250,11 +247,7 @@ def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str, evaluation: E
 def fill_page(
     title: str, about: Mapping[str, Any], scans: str = "", replaced: Mapping[str, str] | None = None
 ) -> str:
-    """Return the text of a page with the viewer's markup, style and scripts.
-
-    Args:
-        replaced: the texts of scripts that replace some of `SCRIPTS`, by the name of the script.
-    """
+    """Return the text of a page with the viewer's markup, style and scripts, or replaced ones."""
     scripts = {name: _source(name) for name in SCRIPTS} | dict(replaced or {})
     style = _source("page.css")
     script = "\n".join(scripts.values())

@@ -67,11 +67,7 @@ class ShownScan:
 
 
 def check_labels(labels: Path, count: int) -> None:
-    """Raise InputError if a file or folder of labels does not exist, or a file has several scans.
-
-    Args:
-        labels: a label file, or a folder of predictions.
-    """
+    """Raise InputError if no labels exist there, or if a label file stands for several scans."""
     if not labels.exists():
         raise InputError(
             f"{labels}: expected a file or a folder of labels, found none; check the path"
@@ -137,9 +133,6 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
 
     It shows the labels of the result, the labels of each network and, if there are two networks,
     the labels of their ensemble, each with its probability.
-
-    Args:
-        result: the result of a `Segmenter`.
     """
     scan = origin.scan
     valid = torch.from_numpy(scan.valid)

@@ -52,12 +52,7 @@ def check_name(repository: str, name: str) -> None:
 
 
 def hub_errors(name: str, advice: str) -> AbstractContextManager[None]:
-    """Turn any error of the hub's client into one line that says what to do.
-
-    Args:
-        name: the beginning of the line.
-        advice: the end of the line.
-    """
+    """Turn any error of the hub's client into one line, from the name to the advice."""
 
     # The classes of the errors depend on the versions of the client and its HTTP library.
     def message(error: BaseException) -> str:

@@ -68,9 +68,6 @@ def resized(weights: Weights, part: str, model: ModelConfig) -> Weights:
     """Return weights in which the sizes of one part come from another configuration.
 
     The parameters stay unchanged: also replace them before you build the model.
-
-    Args:
-        part: "range_net", "polar_net" or "point_head".
     """
     sizes = {key: getattr(model, key) for key in SIZES[part]}
     return dataclasses.replace(weights, model=dataclasses.replace(weights.model, **sizes))

@@ -262,11 +262,7 @@ class Dataset(ABC):
 
 
 def not_trained_on(unseen: Sequence[str]) -> str:
-    """Return the end of an advice: which sequences to name instead of those of a split.
-
-    Args:
-        unseen: sequences on disk that are not of the official split "train".
-    """
+    """Return the end of an advice: which sequences to name that are not of the split "train"."""
     advice = "sequences on which the weights were not trained"
     if not unseen:
         return f"{advice}, with --sequences"

@@ -221,8 +221,7 @@ def _parse_split(entry: Any) -> dict[str, tuple[str, ...]]:
 def _check_keys(title: str, tree: Any, keys: Sequence[str], required: Sequence[str] = ()) -> None:
     """Raise InputError if a mapping lacks a key or has an unknown one, or is no mapping.
 
-    Args:
-        title: the key of the mapping; empty for the whole file.
+    `title` is the key of the mapping; it is empty for the whole file.
     """
     prefix = f"{title}: " if title else ""
     if not isinstance(tree, Mapping):

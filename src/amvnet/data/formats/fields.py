@@ -72,11 +72,7 @@ class Fields:
 
 
 def read_header_line(file: BinaryIO, path: Path, kind: str, end: str) -> list[str]:
-    """Return the words of the next line of a header.
-
-    Args:
-        kind: what the file is, such as "a PCD file".
-        end: the line that ends the header.
+    """Return the words of the next line of a header, which ends with the line `end`.
 
     Raises:
         InputError: if the file ends first, or the header is too long.

@@ -126,12 +126,7 @@ def member_names(path: Path) -> list[str]:
 
 
 def read_array(path: Path, key: str | None = None) -> np.ndarray:
-    """Read an array of numbers of any shape that a scan can have.
-
-    Args:
-        path: a `.npy` or `.npz` file.
-        key: the name of the array in an archive; by default the array of points.
-    """
+    """Read an array of numbers from `.npy` or `.npz`; by default an archive's array of points."""
     with reading(path, "NumPy arrays", ADVICE):
         if not zipfile.is_zipfile(path):
             with path.open("rb") as file:

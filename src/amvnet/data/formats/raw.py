@@ -135,11 +135,9 @@ def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
 
 @np.errstate(invalid="ignore", over="ignore")
 def _usual_layout(data: np.ndarray, is_named: bool) -> RowLayout | None:
-    """Return the layout of KITTI or nuScenes if the values of a file fit it.
+    """Return the layout of KITTI or nuScenes if the bytes (B,) of a file fit it.
 
-    Args:
-        data: (B,) the bytes of the file.
-        is_named: whether the file's name says that it has nuScenes' columns.
+    `is_named` says whether the file's name tells that it has nuScenes' columns.
     """
     if not len(data):
         return None

@@ -51,10 +51,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
 
 
 def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
-    """Read a file of one scan.
-
-    Args:
-        ending: the ending of its format (`ending_of`).
+    """Read a file of one scan in the format of an ending (`ending_of`).
 
     Raises:
         InputError: if the file is broken, or needs a package that is missing.
@@ -105,11 +102,7 @@ def _read_scan(path: Path, bag: tuple[str, str | None, str], index: int) -> Clou
 
 
 def check_packages(place: object, ending: str) -> None:
-    """Raise InputError if a format needs a package that is missing.
-
-    Args:
-        place: the beginning of the message.
-    """
+    """Raise InputError, which begins with `place`, if a format needs a package that is missing."""
     missing = [package for package in PACKAGES.get(ending, ()) if find_spec(package) is None]
     if missing:
         raise InputError(

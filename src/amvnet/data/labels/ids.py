@@ -20,10 +20,7 @@ WIDTHS = (1, 2, 4, 8)  # the sizes of number types that labels may have by mista
 
 
 def read_ids(path: Path, dtype: DTypeLike, count: int) -> np.ndarray:
-    """Read the (N,) raw ids of one scan.
-
-    Args:
-        count: N, the number of points.
+    """Read the (N,) raw ids of one scan, given N as `count`.
 
     Raises:
         InputError: if the file is missing or has another size.
@@ -74,11 +71,7 @@ def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
 
 
 def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> None:
-    """Check the size of a file of labels; an error names the likely mistake.
-
-    Args:
-        name: the beginning of the message.
-        size: the size of the file, bytes.
+    """Check the size of a file of labels, in bytes; an error names the likely mistake.
 
     Raises:
         InputError: if the file cannot hold `count` labels of `dtype`.
@@ -106,10 +99,7 @@ def train_ids(
 ) -> np.ndarray:
     """Return the (N,) uint8 train ids of (N,) raw ids; an error names the likely mistake.
 
-    Args:
-        name: the beginning of the message.
-        raw: (N,) raw ids.
-        advice: as `Taxonomy.to_train` takes it.
+    Messages begin with `name` and end with `advice`, as `Taxonomy.to_train` takes it.
 
     Raises:
         InputError: if an id is no raw id of the taxonomy, or all ids look like float32 or

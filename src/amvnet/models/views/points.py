@@ -109,8 +109,7 @@ class PointBatch:
     def of(cls, scans: Sequence[Scan], device: torch.device | str = "cpu") -> PointBatch:
         """Return a batch of the valid points (`Scan.valid`) of one or more scans, in order.
 
-        For a GPU, points are first copied into pinned memory, which torch uses again for the next
-        batch.
+        For a GPU, points are first copied into pinned memory, which torch uses again.
         """
         valid = [scan.valid for scan in scans]
         sizes = tuple(int(np.count_nonzero(mask)) for mask in valid)
