@@ -65,8 +65,12 @@ def test_help_shows_what_is_public_and_nothing_else() -> None:
     assert "TYPE_CHECKING" not in text
 
 
-def test_importing_loads_neither_torch_nor_numpy() -> None:
-    code = "import amvnet, sys; dir(amvnet); print({'torch', 'numpy', 'scipy'} & set(sys.modules))"
+@pytest.mark.parametrize(
+    ("module", "slow"),
+    [("amvnet", {"torch", "numpy"}), ("amvnet.cli.main", {"torch", "lightning", "matplotlib"})],
+)
+def test_importing_loads_no_slow_library(module: str, slow: set[str]) -> None:
+    code = f"import {module}, sys; dir(amvnet); print(({slow} | {{'scipy'}}) & set(sys.modules))"
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
     assert printed.strip() == b"set()"
 

@@ -16,7 +16,6 @@ import pytest
 import amvnet
 from amvnet.cli.main import COMMANDS, main
 from amvnet.config.recipes import recipe_names
-from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference import timing
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.training import run as training_run
@@ -31,9 +30,6 @@ from fixtures.commands import (
 )
 from fixtures.marks import with_quick
 from fixtures.tiny import GOLDEN
-
-OVERALL = {"miou", "miou_present", "accuracy", "fwiou", "iou"}
-RAW_IDS = set(SEMANTICKITTI.train_to_raw[1:])
 
 
 @pytest.fixture(scope="module")
@@ -213,40 +209,12 @@ def test_a_mistake_is_one_line_and_leaves_nothing(
     assert files(tmp_path) <= RUN_FILES
 
 
-def test_a_run_with_wrong_labels_keeps_no_weights(world: Path, wrong: Path, tmp_path: Path) -> None:
-    options = ("--data", wrong / "mislabelled", "--stage", "rv", "--out", tmp_path)
-    code, error = run_cli("train", world / "recipe.yaml", *options)
-    assert code == 2
-    assert error.splitlines()[-1].startswith("amvnet: ")
-    assert "499" in error  # the labels of a scan of 500 points
-
-    for name in files(tmp_path):
-        assert not name.endswith((".safetensors", "done"))
-
-
-def test_a_broken_scan_leaves_the_others_whole(world: Path, tmp_path: Path) -> None:
-    inputs = (world / "lone.bin", world / "truncated.bin")
-    options = ("--weights", world / "w.safetensors", "--out", tmp_path)
-    code, _ = run_cli("predict", *inputs, *options)
-    assert code == 3
-    assert files(tmp_path) == {"lone.label"}
-    assert len(np.fromfile(tmp_path / "lone.label", np.uint32)) == 300
-
-
 def test_without_a_command_the_usage_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert main(["--help"]) == 0
     usage = capsys.readouterr().out
     for command in COMMANDS:
         assert f"  {command} " in usage
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as leave:
-        main([command, "--help"])
-    assert leave.value.code == 0
-    assert f"amvnet {command}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("order", ["first", "last"])
@@ -270,33 +238,6 @@ def test_a_recipe_counts_wherever_it_stands(
 
 
 # ---- predict
-
-
-def test_a_data_set_is_segmented_into_the_benchmarks_layout(world: Path, tmp_path: Path) -> None:
-    succeed(f"predict {world}/data --weights {world}/w.safetensors --out {tmp_path}")
-
-    names = set()
-    for sequence in ("00", "01", "08"):
-        for scan in ("000000", "000001"):
-            names.add(f"sequences/{sequence}/predictions/{scan}.label")
-    assert files(tmp_path) == names
-
-    for name in names:
-        raw = np.fromfile(tmp_path / name, np.uint32)
-        assert len(raw) == 500
-        assert set(raw.tolist()) <= RAW_IDS
-
-
-def test_lone_scans_are_segmented_by_name_as_the_segmenter_does(
-    world: Path, tmp_path: Path
-) -> None:
-    succeed(f"predict {world}/lone.bin --weights {world}/w.safetensors --out {tmp_path}")
-    assert files(tmp_path) == {"lone.label"}
-
-    points = np.fromfile(world / "lone.bin", np.float32).reshape(-1, 4)
-    labels = amvnet.load(str(world / "w.safetensors"))(points).labels
-    raw = np.fromfile(tmp_path / "lone.label", np.uint32)
-    assert np.array_equal(raw, SEMANTICKITTI.to_raw(labels))
 
 
 def test_scores_are_both_networks_probabilities_in_half_precision(
@@ -324,15 +265,6 @@ def test_scores_are_both_networks_probabilities_in_half_precision(
             assert np.array_equal(arrays[name], probabilities.astype(np.float16))
 
 
-@pytest.mark.parametrize("method", with_quick(["rv", "bev", "ensemble"], ["ensemble"]))
-def test_weights_without_head_predict_by_the_other_methods(
-    method: str, world: Path, tmp_path: Path
-) -> None:
-    options = f"--weights {world}/headless.safetensors --out {tmp_path} --method {method}"
-    succeed(f"predict {world}/lone.bin {options}")
-    assert files(tmp_path) == {"lone.label"}
-
-
 # ---- evaluate
 
 
@@ -358,27 +290,6 @@ def scored(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = f"--weights {world}/w.safetensors --json {out}/m.json --pictures {out}/pictures"
     succeed(f"evaluate {world}/data {options}")
     return out
-
-
-def test_the_figures_have_the_contracts_structure(world: Path, scored: Path) -> None:
-    figures = read_json(scored / "m.json")
-    assert set(figures) == {"dataset", "scans", "points", "uncertain_fraction", "methods"}
-    assert figures["scans"] == 2
-    assert figures["points"] == 1000
-    assert 0 < figures["uncertain_fraction"] < 1
-    assert list(figures["methods"]) == ["rv", "bev", "ensemble", "amvnet"]
-
-    for method in figures["methods"].values():
-        assert set(method) == OVERALL | {"by_distance"}
-        assert list(method["iou"]) == list(SEMANTICKITTI.classes)
-        for key in OVERALL - {"iou"}:
-            assert 0 <= method[key] <= 1
-
-        edges = []
-        for extent in method["by_distance"]:
-            assert set(extent) >= OVERALL
-            edges.append((extent["from_m"], extent["to_m"]))
-        assert edges == [(0, 10), (10, 20), (20, 30), (30, 40), (40, 50)]
 
 
 def test_pictures_are_drawn_and_nothing_else_is_left(scored: Path) -> None:

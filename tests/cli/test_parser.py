@@ -114,6 +114,7 @@ def test_help_is_in_words(command: str, capsys: pytest.CaptureFixture[str]) -> N
         main([command, "--help"])
     assert caught.value.code == 0
     text = capsys.readouterr().out
+    assert f"amvnet {command}" in text
     for word in ("class_path", "init_args", "<class", "Literal[", "null", "type:"):
         assert word not in text
     assert max(map(len, text.splitlines())) <= 120

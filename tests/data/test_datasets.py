@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 
 from amvnet.cli.options import LabelledChoice
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, VAL, NuScenes
+from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.datasets.select import to_train
 from amvnet.data.taxonomy import SEMANTICKITTI
@@ -21,8 +20,6 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from fixtures.commands import fails
 from fixtures.datasets import COUNTS, MAKERS, Layout, make_nuscenes, make_semantickitti
 from fixtures.tiny import make_streets
-
-REAL = os.environ.get("AMVNET_REAL_DATA")
 
 
 @pytest.fixture(params=MAKERS)
@@ -281,14 +278,6 @@ def test_nuscenes_version_must_be_unambiguous(tmp_path: Path) -> None:
     assert open_dataset(f"{tmp_path}@v1.0-mini").sequences("val") == ("scene-0103",)
 
 
-def test_nuscenes_official_splits_have_their_sizes() -> None:
-    assert len(VAL) == 150
-    assert len(MINI_VAL) == 2
-    assert len(MINI_TRAIN) == 8
-    assert {"scene-0103", "scene-0916", "scene-0003", "scene-1073"} <= VAL
-    assert not MINI_VAL & MINI_TRAIN
-
-
 def test_nuscenes_own_names_of_splits_are_taken(tmp_path: Path) -> None:
     dataset = open_dataset(make_nuscenes(tmp_path).spec)
     assert isinstance(dataset, NuScenes)
@@ -355,28 +344,6 @@ def test_a_folder_with_a_description_names_the_yaml_file(tmp_path: Path) -> None
 
 
 # --- real data ---
-
-
-@pytest.mark.skipif(not REAL, reason="AMVNET_REAL_DATA does not name a folder")
-@pytest.mark.parametrize(
-    ("name", "sequence", "rings"), [("semantickitti", "07", 0), ("nuscenes", "scene-0523", 32)]
-)
-def test_real_scans_open(name: str, sequence: str, rings: int) -> None:
-    dataset = open_dataset(str(Path(REAL or "") / name))
-    records = dataset.records([sequence])
-    assert len(records) == 10
-
-    scan = dataset.read(records[0])
-    assert len(scan) > 30_000
-    assert scan.points[:, 3].min() >= 0
-    assert scan.points[:, 3].max() <= 1
-    if rings:
-        assert scan.ring is not None
-        assert scan.ring.max() == rings - 1
-    else:
-        assert scan.ring is None
-
-    assert (scan.labels is None) == (records[0].labels_path is None)
 
 
 @pytest.mark.parametrize(

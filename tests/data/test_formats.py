@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.cloud import MAX_POINTS
-from amvnet.data.formats.find import find_scans, list_scans, read_cloud, scan_stem
+from amvnet.data.formats.find import find_scans, list_scans, read_cloud
 from amvnet.data.formats.pcd import unpack_lzf
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.data.labels.readers import read_raw_labels
@@ -568,12 +568,6 @@ def test_a_dimension_of_las_with_rings_is_read(tmp_path: Path) -> None:
     assert ring.tolist() == list(np.arange(60) % 16)
 
 
-def test_map_coordinates_are_refused_with_advice(tmp_path: Path) -> None:
-    path = tmp_path / "a.las"
-    write_las(path, some_points() + np.array([500_000, 4_000_000, 0, 0]))
-    fails(lambda: read_scan(path), "--offset")
-
-
 # --- bags ---
 
 
@@ -751,14 +745,6 @@ def test_broken_compressed_files_give_an_error_of_one_line(
         path.write_bytes(content[:offset] + b"\xff\xff\xff\x7f" + content[offset + 4 :])
         fails(lambda: read_scan(path), path)
     assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize(
-    ("name", "stem"),
-    [("a.pcd.bin", "a"), ("b.PCD", "b"), ("c.d.las", "c.d"), ("e", "e"), ("f.txt", "f")],
-)
-def test_stems_of_scan_files(name: str, stem: str) -> None:
-    assert scan_stem(Path(name)) == stem
 
 
 # --- real scans ---

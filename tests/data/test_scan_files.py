@@ -12,36 +12,11 @@ import pytest
 from amvnet import read as read_scan
 from amvnet.config.yaml_files import read_yaml
 from amvnet.data.formats.find import find_scans
-from amvnet.data.labels.ids import write_ids
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy
-from amvnet.files import atomic_write
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 
 from fixtures.commands import fails
 
 # --- single files ---
-
-
-@pytest.mark.parametrize("scale", [1.0, 255.0])
-def test_single_scans_in_every_format_agree(tmp_path: Path, scale: float) -> None:
-    points = np.random.default_rng(0).random((9, 4)).astype(np.float32)
-    points[0, 3] = 1.0
-    scaled = points * np.array([1, 1, 1, scale], dtype=np.float32)
-    scaled_to_255 = points * np.array([1, 1, 1, 255], dtype=np.float32)
-    ring = np.arange(9, dtype=np.float32)[:, None]
-
-    scaled.tofile(tmp_path / "a.bin")
-    np.save(tmp_path / "b.npy", scaled.astype(np.float64))
-    np.save(tmp_path / "c.npy", np.hstack([scaled, ring]))
-    np.hstack([scaled_to_255, ring]).tofile(tmp_path / "d.pcd.bin")
-
-    names = ["a.bin", "b.npy", "c.npy", "d.pcd.bin"]
-    assert find_scans(tmp_path) == [tmp_path / name for name in names]
-    for name in names:
-        path = tmp_path / name
-        scan = read_scan(path)
-        np.testing.assert_allclose(scan.points, points, rtol=1e-6)
-        assert (scan.ring is not None) == (name in ("c.npy", "d.pcd.bin"))
-        assert scan.name == str(path)
 
 
 def test_three_columns_get_no_intensity(tmp_path: Path) -> None:
@@ -100,25 +75,6 @@ def test_missing_files_and_empty_folders_are_named(tmp_path: Path) -> None:
     fails(lambda: find_scans(tmp_path / "empty"), tmp_path / "empty")
 
 
-def test_files_appear_whole_or_not_at_all(tmp_path: Path) -> None:
-    target = tmp_path / "deep" / "a.label"
-
-    def stop_halfway() -> None:
-        with atomic_write(target) as part:
-            part.write_bytes(b"half")
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        stop_halfway()
-    assert list(target.parent.iterdir()) == []
-
-    write_ids(target, np.array([10, 259], dtype=np.uint32))
-    assert np.fromfile(target, np.uint32).tolist() == [10, 259]
-
-    fails(lambda: write_ids(target / "b.label", np.zeros(1)), target, "folder")
-    fails(lambda: write_ids(tmp_path, np.zeros(1)), tmp_path)
-
-
 # --- taxonomies ---
 
 
@@ -136,25 +92,11 @@ def test_raw_and_train_ids_are_inverse(taxonomy: Taxonomy) -> None:
     fails(lambda: taxonomy.to_raw(np.array([taxonomy.size + 1])), taxonomy.size + 1)
 
 
-def test_lookup_equals_a_plain_loop() -> None:
-    raw = np.random.default_rng(0).choice(list(SEMANTICKITTI.raw_to_train), 200).astype(np.uint32)
-    train = SEMANTICKITTI.to_train(raw)
-    for raw_id, train_id in zip(raw.tolist(), train.tolist(), strict=True):
-        assert train_id == SEMANTICKITTI.raw_to_train[raw_id]
-    assert SEMANTICKITTI.to_train(raw[:0]).shape == (0,)
-
-
 @pytest.mark.parametrize("taxonomy", TAXONOMIES.values(), ids=TAXONOMIES)
 def test_taxonomy_survives_json_and_pickle(taxonomy: Taxonomy) -> None:
     assert Taxonomy.from_dict(json.loads(json.dumps(taxonomy.to_dict()))) == taxonomy
     assert pickle.loads(pickle.dumps(taxonomy)) == taxonomy
     fails(lambda: Taxonomy.from_dict({"name": "a"}), "classes")
-
-
-def test_sizes_of_the_benchmarks() -> None:
-    assert (SEMANTICKITTI.size, NUSCENES.size) == (19, 16)
-    assert (len(SEMANTICKITTI.raw_to_train), len(NUSCENES.raw_to_train)) == (34, 32)
-    assert SEMANTICKITTI.splits["val"] == ("08",)
 
 
 @pytest.mark.parametrize("text", ["a: 1\nb: 2\na: 3\n", "b: {c: 1, 'c': 2}\n", "- {1: a, 1: b}\n"])

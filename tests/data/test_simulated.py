@@ -257,16 +257,6 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     fails(lambda: dataset.read(second), second.points_path.parent, "a part of them", "delete")
 
 
-def test_predictions_of_streets_round_trip(sensor: str, tmp_path: Path) -> None:
-    dataset = SimulatedStreets(tmp_path / "cache", sensor)
-    record = dataset.records(["8"])[1]
-    ids = dataset.read(record).labels
-    assert ids is not None
-    dataset.write_prediction(record, tmp_path / "out", ids)
-    assert np.array_equal(dataset.read_prediction(record, tmp_path / "out"), ids)
-    fails(lambda: dataset.write_prediction(record, tmp_path / "out", ids[1:]), len(ids))
-
-
 @pytest.mark.parametrize("workers", [0, 2])
 def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
     workers: int, tmp_path: Path

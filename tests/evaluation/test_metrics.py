@@ -101,15 +101,6 @@ def random_example(seed: int, count: int = 500, size: int = 16) -> Example:
     return Example(points, truth, prediction, uncertain=rng.random(count) < 0.2)
 
 
-def test_confusion_equals_a_plain_loop() -> None:
-    example = random_example(0)
-    expected = np.zeros((17, 17), dtype=np.int64)
-    for true_id, predicted_id in zip(example.truth, example.prediction, strict=True):
-        expected[true_id, predicted_id] += 1
-
-    np.testing.assert_array_equal(confusion(example.truth, example.prediction, 16), expected)
-
-
 @pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES], ids=lambda t: t.name)
 def test_metrics_equal_plain_loops(taxonomy: Taxonomy) -> None:
     example = random_example(1, size=taxonomy.size)
@@ -150,13 +141,6 @@ def test_metrics_equal_plain_loops(taxonomy: Taxonomy) -> None:
     assert figures["fwiou"] == pytest.approx(np.mean(iou_of_points))
 
 
-def test_perfect_prediction_scores_one() -> None:
-    ids = np.arange(17)
-    figures = metrics(confusion(ids, ids, 16), NUSCENES)
-    for key in ("miou", "miou_present", "accuracy", "fwiou"):
-        assert figures[key] == 1.0
-
-
 def test_nothing_to_count_is_none_not_a_number() -> None:
     figures = metrics(np.zeros((17, 17), dtype=np.int64), NUSCENES)
     for key in ("miou", "miou_present", "accuracy", "fwiou"):
@@ -187,12 +171,6 @@ def test_halves_add_up() -> None:
     assert first.scans == 1  # the sum left its parts alone
 
 
-def test_order_of_the_points_changes_nothing() -> None:
-    example = random_example(4)
-    order = np.random.default_rng(0).permutation(len(example.points))
-    assert evaluate(example).report("x") == evaluate(example.reordered(order)).report("x")
-
-
 def test_report_has_the_keys_of_the_contract() -> None:
     example = random_example(5)
     report = evaluate(example).report("nuscenes:here")
@@ -205,16 +183,10 @@ def test_report_has_the_keys_of_the_contract() -> None:
 
     figures = {"miou", "miou_present", "accuracy", "fwiou", "iou"}
     assert set(report["methods"]["amvnet"]) == {*figures, "by_distance"}
-    nearest = report["methods"]["rv"]["by_distance"][0]
+    nearest, *_, farthest = report["methods"]["rv"]["by_distance"]
+    assert (nearest["from_m"], farthest["to_m"]) == (0, 50)
     assert {"from_m", "to_m", "miou", "accuracy", "points"} <= set(nearest)
     json.dumps(report, allow_nan=False)
-
-
-def test_uncertain_fraction_is_null_if_nothing_says_so() -> None:
-    example = random_example(6)
-    evaluation = Evaluation(NUSCENES)
-    evaluation.add(example.points, example.truth, {"predictions": example.prediction})
-    assert evaluation.report("x")["uncertain_fraction"] is None
 
 
 def test_distance_bins_are_open_at_both_ends() -> None:

@@ -98,23 +98,6 @@ def test_the_networks_scores_are_probabilities(result: Segmentation) -> None:
         assert np.allclose(probabilities.sum(axis=1), 1, atol=1e-5)
 
 
-def test_uncertain_is_where_the_cosine_similarity_is_low(result: Segmentation) -> None:
-    rv, bev = both_networks(result)
-    f = rv.astype(float)
-    g = bev.astype(float)
-    cosine = (f * g).sum(axis=1) / np.linalg.norm(f, axis=1) / np.linalg.norm(g, axis=1)
-
-    is_clear = np.abs(cosine - THRESHOLD) > 1e-4
-    assert np.array_equal(result.uncertain[is_clear], (cosine <= THRESHOLD)[is_clear])
-    assert 0 < result.uncertain.mean() < 1
-
-
-def test_certain_points_have_the_geometric_mean(result: Segmentation) -> None:
-    rv, bev = both_networks(result)
-    certain = ~result.uncertain
-    assert np.allclose(result.scores[certain], np.sqrt(rv * bev)[certain], atol=1e-6)
-
-
 def with_lost_returns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Insert rows of lost returns; return all points, and which of them are lost."""
     rows = [
@@ -170,12 +153,6 @@ def test_permuted_points_have_permuted_labels(segmenter: Segmenter, result: Segm
     for actual, expected in zip(both_networks(permuted), both_networks(result), strict=True):
         assert np.allclose(actual, expected[order], atol=1e-5)
     assert (permuted.labels == result.labels[order]).mean() > 0.995
-
-
-def test_the_same_points_have_the_same_labels_again(
-    segmenter: Segmenter, result: Segmentation
-) -> None:
-    assert np.array_equal(segmenter(POINTS.copy()).scores, result.scores)
 
 
 def test_a_scan_is_its_points(segmenter: Segmenter, result: Segmentation) -> None:
@@ -355,22 +332,6 @@ def test_a_method_includes_those_that_need_no_more_than_its_networks() -> None:
         assert list(labels) == names
         for name in names:
             assert np.array_equal(labels[name], labels_by(name))  # type: ignore[arg-type]
-
-
-def test_prediction_runs_the_model_as_it_is(segmenter: Segmenter, result: Segmentation) -> None:
-    with torch.inference_mode():
-        scores = segmenter.model(segmenter.batch([Scan(POINTS)]))
-    assert np.array_equal(result.scores, scores.merged.numpy())
-    assert np.array_equal(result.uncertain, scores.uncertain.numpy())
-
-
-@pytest.mark.parametrize(("method", "other"), [("rv", "polar_net"), ("bev", "range_net")])
-def test_by_method_of_one_network_is_that_network(method: MethodName, other: str) -> None:
-    one_network = without(WEIGHTS, "point_head", other)
-    labels, uncertain, _ = labels_by_method(amvnet.load(one_network, method=method), Scan(POINTS))
-    assert list(labels) == [method]
-    assert uncertain is None
-    assert np.array_equal(labels[method], labels_by(method))
 
 
 def test_weights_without_head_are_an_ensemble_and_no_more() -> None:
@@ -562,17 +523,6 @@ def test_fusing_with_weights_without_a_head_is_refused(result: Segmentation) -> 
 
 
 # ---- the package
-
-
-def test_importing_the_package_does_not_import_torch() -> None:
-    code = """
-import sys, amvnet, amvnet.cli.main
-print({"torch", "lightning", "matplotlib", "scipy"} & set(sys.modules))
-"""
-    process = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert process.stdout.strip() == "set()"
 
 
 PEAK = """

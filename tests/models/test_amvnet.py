@@ -19,7 +19,6 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.schema import PointHeadConfig
 from amvnet.models import neighbours
 from amvnet.models import point_head as point_head_module
-from amvnet.models.amvnet import LateFusion
 from amvnet.models.assertion import Disagreement
 from amvnet.models.layers import freeze
 from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
@@ -28,7 +27,6 @@ from amvnet.models.point_head import (
     head_features,
     nearest_neighbours,
     point_table,
-    used_points_table,
 )
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid
@@ -287,18 +285,6 @@ def test_the_ensembles_equal_their_formulas() -> None:
             assert maximum(f, g)[i, k].item() == max(a, b)
 
 
-def test_merging_takes_the_heads_scores_for_uncertain_points_only() -> None:
-    f, g, points, _ = random_scores(20)
-    uncertain = points[:, 0] > 0
-    h = torch.rand(20, K)
-    fusion = LateFusion(Disagreement(), None)
-    merged = fusion.merge(f, g, uncertain, h[uncertain])
-
-    for i, from_head in enumerate(uncertain.tolist()):
-        assert torch.equal(merged[i], h[i] if from_head else geometric_mean(f, g)[i])
-    assert torch.equal(fusion.merge(f, g, uncertain, None), geometric_mean(f, g))
-
-
 class Constant(nn.Module):
     """A stand-in for a network, with the same logits for each pixel or voxel."""
 
@@ -343,18 +329,6 @@ def test_scoring_points_from_the_table_equals_scoring_their_features(
 
     expected = head(*head_features(head.config, table, index, near))
     torch.testing.assert_close(head.score(table, index, near), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_only_the_points_that_occur_are_selected() -> None:
-    uncertain = torch.tensor([7, 3])
-    near = torch.tensor([[3, 9, 9], [0, 7, 3]])
-    points, f, g = torch.rand(12, 4), torch.rand(12, K), torch.rand(12, K)
-    table, (i, k) = used_points_table(points, f, g, uncertain, near)
-
-    whole = point_table(points, f, g)
-    assert torch.equal(table, whole[[0, 3, 7, 9]])
-    assert torch.equal(table[i], whole[uncertain])
-    assert torch.equal(table[k], whole[near])
 
 
 def test_a_scan_of_many_uncertain_points_is_classified_by_sectors_with_the_same_result(
@@ -419,18 +393,6 @@ def test_the_networks_scores_are_those_of_each_points_pixel_and_voxel(
         first = int(grid.voxel[i]) * K
         expected = voxels[first : first + K, grid.pillar[i]].softmax(0)
         torch.testing.assert_close(scores.bev[i], expected)
-
-
-def test_without_a_head_the_result_is_the_ensemble(random_scan: RandomScan) -> None:
-    model = whole_model()
-    batch = PointBatch.of([random_scan(30)])
-    before = model(batch)
-
-    model.point_head = None
-    after = model(batch)
-    assert torch.equal(after.merged, geometric_mean(before.rv, before.bev))
-    assert torch.equal(after.uncertain, before.uncertain)
-    assert not torch.equal(after.merged, before.merged)
 
 
 @pytest.mark.parametrize("counts", [(40, 30), (40, 1), (2, 40), (40, 0, 3)])

@@ -160,12 +160,6 @@ def test_range_image_at_the_paper_size_equals_a_loop(random_scan: RandomScan) ->
     assert_equals_the_loop(random_scan(2000, 5), RangeViewConfig())
 
 
-def test_the_nearest_point_represents_a_pixel_and_the_first_of_equals() -> None:
-    view = project_to_image(scan_of((8, 0, 0), (6, 0, 0), (6, 0, 0), (7, 0, 0)))
-    assert view.pixel.unique().numel() == 1
-    assert view.nearest[view.pixel[0]] == 1
-
-
 def test_points_outside_the_field_of_view_get_the_border_rows() -> None:
     view = project_to_image(scan_of((1, 0, 5), (1, 0, -5), (0, 0, 1), (0, 0, -1)))
     assert (view.pixel // SPHERICAL.width).tolist() == [0, 15, 0, 15]
@@ -495,18 +489,6 @@ def test_rings_and_rows_that_a_scan_of_a_batch_lacks_are_minus_one(random_scan: 
     assert batch.row.tolist() == [*[-1] * 8, 0, 1, 2, 3]
     assert PointBatch.of([without]).ring is None
     assert PointBatch.of([scan]).row is None
-
-
-def test_the_range_view_without_the_cars_own_body_equals_a_loop(random_scan: RandomScan) -> None:
-    config = replace(SPHERICAL, nearest=15.0)
-    scan = random_scan(2000, 5)
-    pixels, nearest, image = range_view_by_loop(scan, config)
-
-    view = RangeView(config).project(PointBatch.of([scan]))
-    assert view.pixel.tolist() == pixels
-    assert view.nearest.tolist() == nearest
-    np.testing.assert_allclose(view.image[0].numpy(), image, rtol=1e-6)
-    assert nearest != range_view_by_loop(scan, SPHERICAL)[1]
 
 
 def test_the_views_without_the_cars_own_body_are_those_of_the_other_points(

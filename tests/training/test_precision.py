@@ -56,17 +56,6 @@ def test_a_mac_trains_on_its_gpu_in_32_bits(monkeypatch: pytest.MonkeyPatch) -> 
     assert precision_of(TrainingConfig(precision="auto", accelerator="gpu")) == "32-true"
 
 
-def test_a_named_precision_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
-    training = TrainingConfig(precision="bf16-mixed", accelerator="cpu")
-    assert precision_of(training) == "bf16-mixed"
-
-
-@pytest.mark.parametrize("recipe", ["simulated-compact", "semantickitti-compact", "finetune"])
-def test_the_recipes_for_small_machines_leave_it_to_the_device(recipe: str) -> None:
-    assert load_recipe(recipe).training.precision == "auto"
-
-
 def recipes_in_mixed_precision() -> list[Any]:
     cases = []
     for recipe in recipe_names():

@@ -29,10 +29,6 @@ EARLIER = {
 }
 
 
-def test_equal_settings_have_no_changes() -> None:
-    assert describe_changes(EARLIER, EARLIER) == []
-
-
 def test_changes_have_both_values_but_no_digests() -> None:
     settings = {
         "model": {"range_net": {"widths": [8, 32], "gru": True}},

@@ -20,7 +20,7 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from amvnet.config.recipes import load_recipe, recipe_names
+from amvnet.config.recipes import load_recipe
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData
@@ -123,10 +123,6 @@ def run(world: Path) -> Path:
     """Train all stages without interruption."""
     train(world, world / "run")
     return world / "run"
-
-
-def test_a_run_ends_with_all_three_parts(run: Path) -> None:
-    assert load(run / "weights.safetensors").parts == PARTS
 
 
 @STAGES
@@ -523,13 +519,6 @@ def test_resuming_a_finished_run_changes_nothing(world: Path, run: Path, tmp_pat
     assert {name: (tmp_path / "run" / name).read_bytes() for name in before} == before
 
 
-def test_an_existing_run_is_not_overwritten_without_resume(world: Path, run: Path) -> None:
-    paths = (run / "weights.safetensors", run / "rv/last.safetensors")
-    before = [path.read_bytes() for path in paths]
-    assert "--resume" in fail(*train_arguments(world, run))
-    assert [path.read_bytes() for path in paths] == before
-
-
 @pytest.mark.full
 def test_a_finished_stage_without_its_checkpoint_is_not_trained_again(
     world: Path, run: Path, tmp_path: Path
@@ -607,10 +596,6 @@ def test_two_stages_trained_at_the_same_time_are_both_kept(
     for stage in ("rv", "bev"):
         trained = load(tmp_path / "run" / stage / "last.safetensors")
         assert weights.digest(PART_OF[stage]) == trained.digest(PART_OF[stage])
-
-
-def test_every_recipe_takes_the_last_epoch() -> None:
-    assert {load_recipe(name).training.keep for name in recipe_names()} == {"last"}
 
 
 @pytest.mark.full
@@ -925,16 +910,6 @@ def test_a_step_that_does_not_fit_into_the_memory_says_what_to_set(
     monkeypatch.setattr(networks, "fit", fill_memory)
     error = fail(*train_arguments(world, tmp_path / "run"), "--stage", "rv")
     assert "--training.rv.accumulate" in error
-
-
-@STAGES
-def test_a_stage_can_be_followed_in_tensorboard(run: Path, stage: str) -> None:
-    events = EventAccumulator(str(run / stage), size_guidance={"images": 0})
-    events.Reload()
-
-    scalars = set(events.Tags()["scalars"])
-    assert {"train/loss", "val/miou", "iou/road"} <= scalars
-    assert any(name.startswith("lr-") for name in scalars)
 
 
 def test_the_share_of_uncertain_points_is_that_of_the_networks(

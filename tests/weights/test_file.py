@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -90,11 +88,6 @@ def test_the_folder_of_a_run_stands_for_its_weights(weights: Weights, tmp_path: 
 def test_the_package_offers_load_and_weights() -> None:
     assert amvnet.weights.load is load
     assert amvnet.weights.Weights is Weights
-
-
-def test_importing_the_package_does_not_import_torch() -> None:
-    code = "import sys, amvnet.weights; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_the_description_can_be_read_without_this_package(weights: Weights, path: Path) -> None:
