@@ -547,14 +547,6 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
     assert files(tmp_path) == names
 
 
-@pytest.mark.parametrize("batch", [0, -1])
-def test_a_batch_of_no_scans_is_refused(world: Path, tmp_path: Path, batch: int) -> None:
-    arguments = ("predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path)
-    code, error = run_cli(*arguments, "--batch", batch)
-    assert (code, error.count("\n")) == (2, 1)
-    assert not files(tmp_path)
-
-
 def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory(
     tmp_path: Path,
 ) -> None:
@@ -574,19 +566,6 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
     assert [batch.count for batch in engine.batches] == [4, 4, 4, 4, 4, 3]
     assert counter.most <= 2 * 4 + READ_AHEAD + 2
     assert not counter.in_memory
-
-
-@pytest.mark.parametrize("command", ["predict", "evaluate", "bench"])
-def test_every_command_that_segments_takes_a_precision_and_a_tau(
-    world: Path, tmp_path: Path, command: str
-) -> None:
-    inputs = {
-        "predict": (world / "data", "--out", tmp_path),
-        "evaluate": (world / "data",),
-        "bench": ("--runs", 1, "--scan", world / "scans/000000.bin"),
-    }
-    options = ("--weights", world / "w.safetensors", "--precision", "bfloat16", "--tau", 0.6)
-    assert run_cli(command, *inputs[command], *options) == (0, "")
 
 
 STAND_INS = {

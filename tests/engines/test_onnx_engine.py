@@ -146,11 +146,6 @@ def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
     assert 0.9 < (labels == expected).mean() < 1
 
 
-def test_int8_of_a_sensor_that_cannot_be_simulated_is_one_line() -> None:
-    weights = replace(WEIGHTS, sensor="mine")
-    fails(lambda: amvnet.load(weights, engine="int8"), "mine", "simulate")
-
-
 @pytest.mark.parametrize("method", ["rv", "bev"])
 def test_onnx_runs_the_methods_of_one_network(method: MethodName) -> None:
     points = random_points(0)

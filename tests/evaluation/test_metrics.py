@@ -88,11 +88,6 @@ class Example:
     prediction: np.ndarray
     uncertain: np.ndarray
 
-    def reordered(self, order: np.ndarray) -> Example:
-        return Example(
-            self.points[order], self.truth[order], self.prediction[order], self.uncertain[order]
-        )
-
 
 def random_example(seed: int, count: int = 500, size: int = 16) -> Example:
     rng = np.random.default_rng(seed)

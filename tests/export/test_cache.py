@@ -168,10 +168,6 @@ def test_a_file_or_a_link_in_the_place_of_a_folder_is_replaced(
     assert exports.count == 3
 
 
-def writable(path: Path, mode: int) -> Callable[[], None]:
-    return lambda: path.chmod(stat.S_IMODE(path.stat().st_mode) | mode)
-
-
 @pytest.mark.parametrize("mode", [stat.S_IWOTH, stat.S_IWGRP])
 @pytest.mark.parametrize("place", ["range_net.onnx", DESCRIPTION, ".", "..", "../..", "../../.."])
 def test_a_cache_that_another_user_can_write_is_not_used_and_that_is_said(

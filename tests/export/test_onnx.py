@@ -28,8 +28,7 @@ from amvnet.data.taxonomy import NUSCENES
 from amvnet.export import onnx as onnx_export
 from amvnet.export.onnx import describe_export
 from amvnet.models.methods import MethodName
-from amvnet.models.neighbours import nearest_others
-from amvnet.onnx_runner import DESCRIPTION, FORMAT, OnnxSegmenter, pool
+from amvnet.onnx_runner import DESCRIPTION, FORMAT, OnnxSegmenter
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import (
     SIMULATED_QUANTILES,
@@ -129,22 +128,6 @@ def test_the_runner_says_what_torch_says(exported: Exports, name: str, count: in
     assert actual.scores.dtype == np.float32
     assert not actual.labels[~scan.valid].any()
     assert not actual.scores[~scan.valid].any()
-
-
-@each_export
-def test_the_networks_alone_say_what_torch_says(exported: Exports, name: str) -> None:
-    scan = make_scan(7)
-    valid = scan.valid
-    expected = amvnet.load(exported[name].weights)(scan)
-    assert scan.ring is not None
-    assert expected.rv is not None
-    assert expected.bev is not None
-
-    runner = OnnxSegmenter(exported[name].folder)
-    f = runner.score_range_view(scan.select(valid))
-    g = runner.score_polar_view(scan.points[valid])
-    assert np.abs(f - expected.rv[valid]).max() <= 1e-4
-    assert np.abs(g - expected.bev[valid]).max() <= 1e-4
 
 
 @pytest.mark.parametrize("method", ["ensemble", "rv", "bev"])
@@ -305,24 +288,6 @@ np.save({str(labels)!r}, result.labels)
     expected = amvnet.load(exported["shallow"].weights)(scan).labels
     assert (np.load(labels) == expected).mean() >= 0.9999
     assert not list(home.iterdir())
-
-
-def test_pooling_is_the_maximum_of_each_pillar() -> None:
-    rng = np.random.default_rng(0)
-    pillar = rng.integers(0, 9, 50)
-    features = rng.normal(size=(50, 3)).astype(np.float32)
-    occupied, pooled = pool(pillar, features)
-    assert occupied.tolist() == sorted(set(pillar.tolist()))
-    for index, values in zip(occupied, pooled, strict=True):
-        assert values.tolist() == features[pillar == index].max(axis=0).tolist()
-
-
-def test_neighbours_are_the_nearest_of_all_others() -> None:
-    xyz = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
-    for own, nearest in enumerate(nearest_others(xyz, np.arange(40), 5)):
-        distances = np.linalg.norm(xyz - xyz[own], axis=1)
-        distances[own] = np.inf
-        assert nearest.tolist() == np.argsort(distances, kind="stable")[:5].tolist()
 
 
 def remove(name: str) -> Callable[[Path], None]:

@@ -10,7 +10,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -46,7 +45,7 @@ from fixtures.commands import (
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.datasets import MAKERS
 from fixtures.marks import with_full
-from fixtures.processes import PATIENCE, running
+from fixtures.processes import running
 from fixtures.tiny import fresh_weights, make_streets, street
 from fixtures.world import SCANS
 
@@ -594,21 +593,6 @@ def test_scans_side_by_side_get_the_labels_they_get_one_by_one(
     succeed(predict(world, tmp_path, f"--at-once {at_once}"))
     check_same(tmp_path, whole)
     assert torch.get_num_threads() == threads
-
-
-def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
-    """Each of two scans waits for the other."""
-    barrier = threading.Barrier(2, timeout=PATIENCE)
-
-    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
-        barrier.wait()
-        return list(map(no_segmentation, scans))
-
-    scans = counted_scans(2, Counter())
-    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), at_once=2)
-    first, second = pipeline.stream(scans, pipeline.write_or_explain)
-    assert isinstance(first, Entry)
-    assert isinstance(second, Entry)
 
 
 @pytest.mark.parametrize(("options", "expected"), [("", 2), ("--at-once 3", 3), ("--batch 2", 2)])

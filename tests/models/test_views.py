@@ -469,15 +469,6 @@ def test_a_point_batch_leaves_lost_points_out(random_scan: RandomScan, lost: flo
     assert batch.ring.tolist() == scan.ring[valid].tolist()
 
 
-def test_slices_say_where_each_scan_stands(random_scan: RandomScan) -> None:
-    scans = [random_scan(3), random_scan(0), random_scan(4), random_scan(0)]
-    batch = PointBatch.of(scans)
-
-    assert batch.slices() == [slice(0, 3), slice(3, 3), slice(3, 7), slice(7, 7)]
-    assert batch.scan.tolist() == [0, 0, 0, 2, 2, 2, 2]
-    assert batch.count == 4
-
-
 def test_rings_and_rows_that_a_scan_of_a_batch_lacks_are_minus_one(random_scan: RandomScan) -> None:
     scan = random_scan(4)
     assert scan.ring is not None

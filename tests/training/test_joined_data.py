@@ -362,13 +362,6 @@ def test_a_fine_tuning_needs_weights(world: Path, tmp_path: Path) -> None:
     assert "--init" in refusal(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}")
 
 
-def test_scans_without_labels_are_not_mixed_in(world: Path, tmp_path: Path) -> None:
-    data = make_streets(tmp_path / "b", ("00",), 3)
-    (data / "sequences/00/labels/000001.label").unlink()
-    names = [record.name for record in to_mix_in(open_dataset(str(data))).train]
-    assert names == ["00/000000", "00/000002"]
-
-
 def test_all_sequences_of_another_dataset_are_mixed_in_if_it_has_no_split(tmp_path: Path) -> None:
     data = open_dataset(str(make_streets(tmp_path / "b", ("00", "01", "02"), 2)))
     (data.root / "sequences/01/labels/000001.label").unlink()
@@ -445,9 +438,3 @@ def test_any_classes_fit_a_recipe_that_takes_the_model_of_init(tmp_path: Path) -
     Plan(recipe, scans, tmp_path / "run")
     with pytest.raises(InputError, match="use the recipe of that benchmark"):
         Plan(load_recipe("nuscenes-compact"), scans, tmp_path / "run")
-
-
-def test_the_recipe_mixes_half_of_an_epoch() -> None:
-    recipe = load_recipe("finetune")
-    assert recipe.from_init
-    assert recipe.training.others == 0.5

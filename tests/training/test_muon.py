@@ -105,21 +105,6 @@ def test_a_kernel_without_a_gradient_stays() -> None:
     assert torch.equal(hidden_kernel(net), before)
 
 
-def test_a_closure_computes_the_gradients() -> None:
-    net = small_net()
-    optimizer = Muon(net, LR, DECAY)
-    before = copy.deepcopy(net.state_dict())
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        loss = net(torch.ones(1, 6, 8, 8)).square().sum()
-        loss.backward()
-        return loss
-
-    assert optimizer.step(closure).item() > 0
-    assert not torch.equal(hidden_kernel(net), before["2.weight"])
-
-
 def test_a_training_goes_on_from_its_state() -> None:
     whole, stopped = small_net(), small_net()
     take_steps(whole, Muon(whole, LR, DECAY), gradients(whole, 5))

@@ -38,14 +38,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "demo"
 
 
-def test_the_page_has_truth_all_methods_and_uncertain_points(folder: Path) -> None:
-    page = read_page(folder / "index.html")
-    keys = [source["key"] for source in page.about["sources"]]
-    assert keys == ["truth", "rv", "bev", "ensemble", "amvnet"]
-    _, planes = page.scan(0)
-    assert "uncertain" in planes
-
-
 def test_the_table_of_the_page_has_the_figures_that_are_written(folder: Path) -> None:
     report = json.loads((folder / "metrics.json").read_text())
     table = read_page(folder / "index.html").about["table"]

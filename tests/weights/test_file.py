@@ -20,7 +20,6 @@ import amvnet.weights
 from amvnet.config.nested import to_dict
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.segmentation import Segmentation
 from amvnet.weights.file import PARTS, Weights, built_in, load, save
 
 from fixtures.tiny import fresh_weights, street
@@ -36,10 +35,6 @@ def weights() -> Weights:
 @pytest.fixture(scope="module")
 def path(weights: Weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(weights, tmp_path_factory.mktemp("weights") / "w.safetensors")
-
-
-def segment(weights: Weights | str) -> Segmentation:
-    return amvnet.load(weights)(POINTS)
 
 
 def ensemble_scores(weights: Weights) -> np.ndarray:
@@ -73,21 +68,9 @@ def test_saved_weights_are_loaded_unchanged(weights: Weights, path: Path) -> Non
     assert replace(loaded, tensors={}) == replace(weights, tensors={})
 
 
-def test_loaded_weights_segment_like_the_saved_ones(weights: Weights, path: Path) -> None:
-    saved = segment(weights)
-    loaded = segment(str(path))
-    assert np.array_equal(loaded.scores, saved.scores)
-    assert np.array_equal(loaded.labels, saved.labels)
-
-
 def test_the_folder_of_a_run_stands_for_its_weights(weights: Weights, tmp_path: Path) -> None:
     save(weights, tmp_path / "weights.safetensors")
     assert load(tmp_path).parts == PARTS
-
-
-def test_the_package_offers_load_and_weights() -> None:
-    assert amvnet.weights.load is load
-    assert amvnet.weights.Weights is Weights
 
 
 def test_the_description_can_be_read_without_this_package(weights: Weights, path: Path) -> None:
