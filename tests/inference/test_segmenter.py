@@ -179,12 +179,6 @@ def test_a_scan_without_points_is_refused(points: np.ndarray, method: MethodName
         amvnet.load(WEIGHTS, method=method)(points.astype(np.float32))
 
 
-@pytest.mark.parametrize("shape", [(5,), (5, 2), (4, 100), (1, 5, 4)])
-def test_points_of_other_shapes_are_refused(segmenter: Segmenter, shape: tuple[int, ...]) -> None:
-    with pytest.raises(InputError):
-        segmenter(np.ones(shape, np.float32))
-
-
 def test_probabilities_are_the_scores_with_rows_that_sum_to_1(segmenter: Segmenter) -> None:
     points, is_lost = with_lost_returns(POINTS)
     result = segmenter(points)
@@ -332,6 +326,15 @@ def test_a_method_includes_those_that_need_no_more_than_its_networks() -> None:
         assert list(labels) == names
         for name in names:
             assert np.array_equal(labels[name], labels_by(name))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("method", "other"), [("rv", "polar_net"), ("bev", "range_net")])
+def test_by_method_of_one_network_is_that_network(method: MethodName, other: str) -> None:
+    one_network = without(WEIGHTS, "point_head", other)
+    labels, uncertain, _ = labels_by_method(amvnet.load(one_network, method=method), Scan(POINTS))
+    assert list(labels) == [method]
+    assert uncertain is None
+    assert np.array_equal(labels[method], labels_by(method))
 
 
 def test_weights_without_head_are_an_ensemble_and_no_more() -> None:

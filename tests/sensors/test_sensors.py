@@ -360,17 +360,6 @@ def test_scans_of_two_robots_in_one_source_get_their_own_heights() -> None:
         assert rise == pytest.approx(height - 1.73, abs=0.05)
 
 
-@pytest.mark.parametrize("up", [1.5, 1.73, 2.0])
-def test_a_scan_whose_origin_is_on_the_ground_or_below_is_moved(up: float) -> None:
-    points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
-    raised = points + np.array([0, 0, up, 0], np.float32)
-
-    normaliser, _ = make_normaliser()
-    scan = normaliser(make_cloud(raised), "raised")
-    expected = normaliser(make_cloud(points), "level")
-    assert_alike(scan, expected, atol=0.05)
-
-
 COORDINATE = (
     st.floats(width=32)
     | st.floats(-50, 50, width=32)
@@ -454,13 +443,6 @@ def test_a_wrong_description_is_named(tmp_path: Path, text: str, words: list[str
     fails(lambda: make_sensor(str(path)), path, *words)
 
 
-def test_wrong_options_are_named(tmp_path: Path) -> None:
-    fails(lambda: make_sensor("eye"), "eye", "vlp16")
-    fails(lambda: make_sensor(str(tmp_path / "no.yaml")), "no.yaml")
-    fails(lambda: make_sensor(rotate="1,2"), "rotate", "90,0,0")
-    fails(lambda: make_sensor(intensity_scale="much"), "intensity_scale", "much")
-
-
 def test_sensors_are_described_as_they_are_simulated() -> None:
     """The field of view is that of the points, seen from the origin of the coordinates."""
     for name, simulated in LIDAR_MODELS.items():
@@ -536,18 +518,6 @@ def test_a_bag_is_segmented_scan_by_scan(
     expected = (tmp_path / "robot.label").read_bytes()
     for path in (tmp_path / "drive").glob("*.label"):
         assert path.read_bytes() == expected
-
-
-def test_options_override_what_is_measured(world: Path, tmp_path: Path) -> None:
-    def predict(name: str, *options: object) -> np.ndarray:
-        out = tmp_path / name
-        arguments = ("--weights", world / "w.safetensors", "--out", out, *options)
-        assert run_cli("predict", world / "robot.bin", *arguments)[0] == 0
-        return np.fromfile(out / "robot.label", np.uint32)
-
-    measured = predict("measured")
-    assert np.mean(measured == predict("right", "--height", 0.9)) > 0.95
-    assert np.mean(measured == predict("wrong", "--height", 2.9)) < 0.95
 
 
 @pytest.mark.parametrize(
