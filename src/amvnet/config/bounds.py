@@ -69,11 +69,7 @@ class Checked:
                 _check_range(name, value, kind)
 
     def check(self, holds: bool, expected: str, found: str) -> None:
-        """Check a condition on several numbers.
-
-        Raises:
-            InputError: if the condition does not hold.
-        """
+        """Check a condition on several numbers; raise InputError if the condition does not hold."""
         if not holds:
             raise InputError(f"expected {expected}, found {found}; correct the values")
 

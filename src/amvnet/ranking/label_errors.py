@@ -114,11 +114,7 @@ def rank(
 
 
 def measure_doubts(scan: Scan, segmenter: Segmenter) -> PointDoubts:
-    """Return how doubtful each label of a scan is.
-
-    Raises:
-        InputError: if the scan has no labels.
-    """
+    """Return how doubtful each label of a scan is; raise InputError if the scan has no labels."""
     label = scan.labels
     if label is None:
         raise InputError(
