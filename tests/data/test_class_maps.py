@@ -14,7 +14,7 @@ from amvnet.data.class_maps import BUILT_IN, class_map
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.weights.file import save
 
-from fixtures.commands import fails, refusal, run_cli
+from fixtures.commands import fails, refusal, succeed
 from fixtures.tiny import GOLDEN, fresh_weights, make_streets
 
 EQUAL = {  # classes of SemanticKITTI and of nuScenes that each built-in map takes for the same
@@ -99,8 +99,7 @@ def test_predict_writes_the_ids_of_the_map_for_datasets_and_files(tmp_path: Path
         fine = tmp_path / f"fine-{inputs.name}"
         coarse = tmp_path / f"coarse-{inputs.name}"
         for out, options in ((fine, []), (coarse, ["--classes", "coarse"])):
-            code, error = run_cli("predict", inputs, "--weights", weights, "--out", out, *options)
-            assert code == 0, error
+            succeed("predict", inputs, "--weights", weights, "--out", out, *options)
         raw = np.fromfile(fine / inner / "000000.label", np.uint32)
         expected = table[SEMANTICKITTI.to_train(raw)]
         found = np.fromfile(coarse / inner / "000000.label", np.uint32)
@@ -116,11 +115,10 @@ def test_weights_of_one_benchmark_are_scored_on_the_other_by_coarse_classes(
     # Rows by elevation, as the weights of KITTI have them.
     weights = save(fresh_weights(), tmp_path / "w.safetensors")
     figures = tmp_path / "figures.json"
-    code, error = run_cli(
+    succeed(
         *("evaluate", f"nuscenes:{GOLDEN / 'nuscenes'}", "--weights", weights),
         *("--classes", "coarse", "--split", "all", "--json", figures),
     )
-    assert code == 0, error
     report = json.loads(figures.read_text())["methods"]["amvnet"]
     assert list(report["iou"]) == list(class_map("coarse").target.classes)
 
@@ -141,11 +139,10 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
         matrix += [(raw == value).sum() for value in (40, 48, 50, 48)]
 
     figures = tmp_path / "figures.json"
-    code, error = run_cli(
+    succeed(
         *("evaluate", data, "--predictions", tmp_path / "out"),
         *("--classes", "coarse", "--json", figures),
     )
-    assert code == 0, error
     iou = json.loads(figures.read_text())["methods"]["predictions"]["iou"]
     assert iou["vehicle"] == 1
     assert iou["ground"] == pytest.approx(matrix[0] / (matrix[0] + matrix[1]))

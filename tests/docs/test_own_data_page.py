@@ -14,7 +14,7 @@ from amvnet.weights.file import load, save
 from lidarstreets import LIDAR_MODELS, SimulatedScan
 
 from fixtures import own_scans
-from fixtures.commands import run_cli
+from fixtures.commands import succeed
 from fixtures.own_scans import CLASSES, make_own_scans
 from fixtures.pages import Changes, DocsPage, run
 from fixtures.tiny import fake_drive, fresh_weights, simulate_in_this_process, write_recipe
@@ -85,10 +85,7 @@ def test_scores_are_of_the_users_classes(tmp_path: Path, monkeypatch: pytest.Mon
     assert (truth == -1).any()
 
     figures = tmp_path / "figures.json"
-    code, error = run_cli(
-        "evaluate", data, "--predictions", tmp_path / "perfect", "--json", figures
-    )
-    assert code == 0, error
+    succeed("evaluate", data, "--predictions", tmp_path / "perfect", "--json", figures)
     report = json.loads(figures.read_text())["methods"]["predictions"]
     assert list(report["iou"]) == list(CLASSES)
     assert report["accuracy"] == 1

@@ -19,7 +19,7 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.scores import ScoreFolder, ScorePair
 from amvnet.weights.file import load, save
 
-from fixtures.commands import files, run_cli
+from fixtures.commands import files, refusal, run_cli
 from fixtures.pages import Changes, DocsPage, run
 from fixtures.tiny import (
     fresh_weights,
@@ -268,8 +268,7 @@ def test_broken_scores_are_one_line_that_says_what_to_do(world: Path, tmp_path: 
 
         scores = ("--scores-a", world / "predictions", "--scores-b", folder)
         out = tmp_path / "out"
-        code, error = run_cli("fuse", tmp_path / "data", *scores, "--out", out)
-        assert (code, error.count("\n")) == (2, 1), kind
+        error = refusal("fuse", tmp_path / "data", *scores, "--out", out)
         for word in broken.words:
             assert word in error, kind
         assert not files(out), kind
@@ -295,8 +294,7 @@ def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) ->
         "--scores-b": (*first, "--stage", "head"),
     }
     for word, options in cases.items():
-        code, error = run_cli(*arguments, *options)
-        assert code == 2
+        error = refusal(*arguments, *options)
         assert word in error
     assert not files(tmp_path)
 
@@ -371,8 +369,7 @@ def test_the_run_resumes_with_its_own_scores_only(world: Path, head: Path) -> No
     assert run_cli(*arguments, *score_options(world)) == (0, "")
 
     scores = ["--scores-a", world / "predictions", "--scores-b", world / "predictions"]
-    code, error = run_cli(*arguments, *scores, "--logits", "a")
-    assert code == 2
+    error = refusal(*arguments, *scores, "--logits", "a")
     assert "scores" in error
 
 

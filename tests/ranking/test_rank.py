@@ -28,7 +28,7 @@ from amvnet.ranking.label_errors import (
 )
 from amvnet.weights.file import save
 
-from fixtures.commands import files, run_cli
+from fixtures.commands import files, refusal, run_cli
 from fixtures.engines import giving, scripted
 from fixtures.tiny import fresh_weights, make_streets, without
 
@@ -249,10 +249,7 @@ def test_scans_without_labels_are_refused(world: Path, tmp_path: Path) -> None:
         shutil.rmtree(folder / "labels")
     options = ("--weights", world / "w.safetensors", "--out", tmp_path / "next.csv")
 
-    code, error = run_cli("rank", tmp_path / "data", *options)
-
-    assert code == 2
-    assert error.count("\n") == 1
+    error = refusal("rank", tmp_path / "data", *options)
     assert "labels" in error
 
 
@@ -264,10 +261,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(
     world: Path, tmp_path: Path, weights: str, word: str
 ) -> None:
     options = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path / "next.csv")
-    code, error = run_cli("rank", world / "data", *options)
-
-    assert code == 2
-    assert error.count("\n") == 1
+    error = refusal("rank", world / "data", *options)
     assert word in error
     assert not files(tmp_path)
 

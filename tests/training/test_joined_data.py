@@ -42,7 +42,7 @@ from amvnet.training.plan import (
 )
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.commands import refusal, run_cli
+from fixtures.commands import refusal, run_cli, succeed
 from fixtures.own_scans import make_own_scans
 from fixtures.tiny import (
     BUILDING,
@@ -340,8 +340,7 @@ def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
     # Without the broken sequence, so that all have labels.
     make_streets(tmp_path / "b", ("00",), 3)
     command = arguments(world, tmp_path / "run", str(tmp_path / "b"))
-    code, error = run_cli(*command, "--training.others", "0.4")
-    assert code == 0, error
+    succeed(*command, "--training.others", "0.4")
     start = load(world / "start.safetensors")
     trained = load(tmp_path / "run")
     assert trained.model == start.model

@@ -37,7 +37,7 @@ from amvnet.training.networks import NetworkStage, train_network
 from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights, load, save
 
-from fixtures.commands import files, run_cli
+from fixtures.commands import files, refusal, run_cli, succeed
 from fixtures.processes import Printed, become_cli, fork_server, start_cli
 from fixtures.tiny import (
     BUILDING,
@@ -70,22 +70,13 @@ def train(world: Path, out: Path, *options: object) -> Weights:
     arguments = train_arguments(world, out)
     if "--data" in options:
         del arguments[2:4]
-    code, error = run_cli(*arguments, *options)
-    assert code == 0, error
+    succeed(*arguments, *options)
     return load(out / "weights.safetensors")
 
 
 def train_arguments(world: Path, out: Path) -> list[object]:
     arguments = ["train", world / "recipe.yaml", "--data", world / "data", "--out", out]
     return arguments
-
-
-def fail(*arguments: object) -> str:
-    """Run a command that must fail by the user's mistake; return its one line of error."""
-    code, error = run_cli(*arguments)
-    assert code == 2, error
-    assert error.count("\n") == 1, error
-    return error
 
 
 def differing(a: Weights, b: Weights) -> set[str]:
@@ -134,10 +125,7 @@ def test_a_stage_writes_its_best_and_last_weights_and_its_curves(run: Path, stag
 
 
 def test_an_earlier_run_is_refused_before_the_data_are_read(run: Path) -> None:
-    code, error = run_cli(
-        "train", "semantickitti-compact", "--data", run / "missing.yaml", "--out", run
-    )
-    assert code == 2
+    error = refusal("train", "semantickitti-compact", "--data", run / "missing.yaml", "--out", run)
     assert "expected no earlier run" in error
 
 
@@ -206,7 +194,7 @@ def test_an_epoch_without_a_labelled_point_is_an_error_and_writes_no_weights(
 
     options = ("--stage", "rv", "--training.rv.epochs", 1, "--training.rv.batch", 1)
     monkeypatch.setattr(loaders, "augment", lambda scan, *_: ignore(scan, 0))
-    error = fail(*train_arguments(world, tmp_path / "none"), *options)
+    error = refusal(*train_arguments(world, tmp_path / "none"), *options)
     assert "none in 4 batches" in error
     kept = (".safetensors", ".ckpt")
     assert not {name for name in files(tmp_path / "none") if name.endswith(kept)}
@@ -357,11 +345,10 @@ def test_a_part_that_the_initial_weights_lack_is_missed_before_the_first_stage(
     world: Path, tmp_path: Path
 ) -> None:
     save(without(fresh_weights(), "polar_net"), tmp_path / "rv.safetensors")
-    code, error = run_cli(
+    error = refusal(
         *("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run"),
         *("--init", tmp_path / "rv.safetensors", "--training.bev.initial", 0.5),
     )
-    assert code == 2
     assert "polar_net to begin with, found range_net, point_head in --init" in error
     assert not (tmp_path / "run").exists()
 
@@ -372,7 +359,9 @@ def test_a_run_is_not_resumed_from_other_initial_weights(world: Path, tmp_path: 
     for seed in (1, 2):
         save(fresh_weights(seed=seed), tmp_path / f"{seed}.safetensors")
     assert run_cli(*command, tmp_path / "1.safetensors")[0] == 0
-    assert "other weights to begin with" in fail(*command, tmp_path / "2.safetensors", "--resume")
+    assert "other weights to begin with" in refusal(
+        *command, tmp_path / "2.safetensors", "--resume"
+    )
     assert run_cli(*command, tmp_path / "1.safetensors", "--resume")[0] == 0
 
 
@@ -380,11 +369,10 @@ def test_a_run_is_not_resumed_from_other_initial_weights(world: Path, tmp_path: 
 def test_no_initial_weights_to_keep_or_distil_is_one_line(
     world: Path, tmp_path: Path, option: str
 ) -> None:
-    code, error = run_cli(
+    error = refusal(
         *("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run"),
         *(f"--training.rv.{option}", 0.5),
     )
-    assert code == 2
     assert "--init" in error
 
 
@@ -465,7 +453,7 @@ def test_a_resumed_run_keeps_the_curves_of_its_earlier_epochs(world: Path, tmp_p
 
 def test_a_refused_run_leaves_the_recipe_of_the_existing_run(world: Path, run: Path) -> None:
     before = (run / "recipe.yaml").read_bytes()
-    fail(*train_arguments(world, run), "--training.seed", 9)
+    refusal(*train_arguments(world, run), "--training.seed", 9)
     assert (run / "recipe.yaml").read_bytes() == before
 
 
@@ -478,7 +466,7 @@ def test_a_run_is_not_resumed_with_other_values(
 ) -> None:
     names = ("recipe.yaml", "run.yaml", "weights.safetensors")
     before = {name: (run / name).read_bytes() for name in names}
-    error = fail(*train_arguments(world, run), "--resume", *other)
+    error = refusal(*train_arguments(world, run), "--resume", *other)
     assert "stage.yaml" in error
     assert {name: (run / name).read_bytes() for name in names} == before
 
@@ -488,7 +476,7 @@ def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
     train_interrupted("rv", 2, world, tmp_path, "--stage", "rv")
     checkpoint = tmp_path / "rv/last.ckpt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    error = fail(*train_arguments(world, tmp_path), "--stage", "rv", "--resume")
+    error = refusal(*train_arguments(world, tmp_path), "--stage", "rv", "--resume")
     assert "last.ckpt" in error
 
 
@@ -501,7 +489,7 @@ def test_a_broken_label_file_is_one_line_of_error_from_a_reading_process_too(
     np.full(499, CAR, np.uint32).tofile(label)  # of 500 points
 
     options = ("--stage", "rv", "--training.rv.class_weights", "false", "--training.workers", 1)
-    error = fail(
+    error = refusal(
         "train", world / "recipe.yaml", "--data", data, "--out", tmp_path / "run", *options
     )
     assert "499" in error
@@ -528,7 +516,7 @@ def test_a_finished_stage_without_its_checkpoint_is_not_trained_again(
     for stage in PART_OF:
         (out / stage / "last.ckpt").unlink()
     before = {path: (out / path).read_bytes() for path in files(out)}
-    assert "--resume" in fail(*train_arguments(world, out))
+    assert "--resume" in refusal(*train_arguments(world, out))
     assert {path: (out / path).read_bytes() for path in files(out)} == before
     assert not differing(train(world, out, "--resume"), load(run))
 
@@ -691,7 +679,7 @@ def test_a_new_head_is_trained_on_the_networks_of_weights_with_another_one(
     # A finished stage is not trained again; one of another head is refused.
     assert not differing(weights, train(world, tmp_path / "run", *options, "--resume"))
     arguments = (*train_arguments(world, tmp_path / "run"), "--stage", "head", "--resume")
-    assert "point_head.fc" in fail(*arguments, "--model.point_head.fc", 16)
+    assert "point_head.fc" in refusal(*arguments, "--model.point_head.fc", 16)
 
 
 @pytest.mark.full
@@ -727,7 +715,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(
         return loss(self, scored) * (math.inf if len(steps) == 3 else 1)
 
     monkeypatch.setattr(NetworkStage, "loss", diverging)
-    error = fail(*train_arguments(world, out), "--stage", stage)
+    error = refusal(*train_arguments(world, out), "--stage", stage)
     assert "finite" in error
     assert "00/0" in error or "01/0" in error
     assert not (out / "weights.safetensors").exists()
@@ -908,7 +896,7 @@ def test_a_step_that_does_not_fit_into_the_memory_says_what_to_set(
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(networks, "fit", fill_memory)
-    error = fail(*train_arguments(world, tmp_path / "run"), "--stage", "rv")
+    error = refusal(*train_arguments(world, tmp_path / "run"), "--stage", "rv")
     assert "--training.rv.accumulate" in error
 
 
