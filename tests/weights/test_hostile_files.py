@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import torch
 from safetensors.torch import save_file
 
 from amvnet.config.nested import to_dict
+from amvnet.config.schema import ModelConfig
 from amvnet.config.yaml_files import read_yaml
 from amvnet.weights.card import model_card
 from amvnet.weights.file import FORMAT, Weights, load
@@ -50,40 +51,20 @@ def change(tree: Any, path: str, value: Any) -> Any:
     return changed
 
 
+def places(tree: Any, kind: type, path: str = "") -> Iterator[str]:
+    """Yield the places of values of a type, but no integer that may be 0; of a list, the first."""
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            yield from places(value, kind, f"{path} {key}".strip())
+    elif isinstance(tree, list | tuple):
+        yield from places(tree[0], kind, f"{path} 0")
+    elif type(tree) is kind and (tree or kind is float):
+        yield path
+
+
 # Values of the model that no file of this package has, by their places.
-SIZES = (
-    "range_view height",
-    "range_view width",
-    "polar_view radial",
-    "polar_view angular",
-    "polar_view vertical",
-    "range_net stem",
-    "range_net widths 0",
-    "range_net blocks 1",
-    "range_net height_strides 0",
-    "range_net decoder",
-    "range_net head",
-    "polar_net point_widths 0",
-    "polar_net pillar",
-    "polar_net widths 1",
-    "polar_net dropblock_size",
-    "point_head neighbours",
-    "point_head hidden 0",
-    "point_head fc",
-)
-NUMBERS = (
-    "range_view fov_up",
-    "range_view fov_down",
-    "polar_view radius_min",
-    "polar_view radius_max",
-    "polar_view z_min",
-    "polar_view z_max",
-    "range_net dropout",
-    "range_net gru_padding",
-    "polar_net dropblock",
-    "assertion threshold",
-    "point_head position_scale",
-)
+SIZES = tuple(places(to_dict(ModelConfig()), int))
+NUMBERS = tuple(places(to_dict(ModelConfig()), float))
 MODEL: dict[str, tuple[str, Any]] = {
     **{f"{path} = 10**12": (path, HUGE) for path in SIZES},
     **{f"{path} = 0": (path, 0) for path in SIZES},
