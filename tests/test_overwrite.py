@@ -124,7 +124,9 @@ ALIKE = ("npy", "ply", "scores", "uncertain", "dataset")  # they are like `predi
 
 
 @pytest.mark.parametrize("name", with_full(CASES, ALIKE))
-def test_a_users_file_stays_and_nothing_is_written(name: str, world: Path, tmp_path: Path) -> None:
+def test_a_users_file_stays_and_nothing_is_written(
+    name: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     case = CASES[name]
     mine = tmp_path / case.file
     mine.parent.mkdir(parents=True, exist_ok=True)
@@ -140,6 +142,7 @@ def test_a_users_file_stays_and_nothing_is_written(name: str, world: Path, tmp_p
     assert "found another file" in line
     assert mine.read_bytes() == MINE
     assert files(tmp_path) == {case.file}
+    assert "computing on" not in capsys.readouterr().out  # the networks are not loaded for that
 
 
 @pytest.mark.parametrize("name", with_full(CASES, SLOW + ALIKE))

@@ -70,25 +70,6 @@ def test_a_missing_input_is_found_before_the_networks_are_loaded(
     assert "computing on" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "predict {w}/lone.bin --weights {w}/w.safetensors --out {out}",
-        "evaluate {w}/data --weights {w}/w.safetensors --json {out}/lone.label",
-        "view {w}/lone.bin --weights {w}/w.safetensors --html {out}/lone",
-        "rank {w}/data --weights {w}/w.safetensors --out {out}/lone.label",
-        "bench --weights {w}/w.safetensors --json {out}/lone.label",
-    ],
-)
-def test_an_existing_output_is_found_before_the_networks_are_loaded(
-    command: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("lone.label", "lone.html"):
-        (tmp_path / name).write_bytes(bytes(4))
-    assert "--overwrite" in refusal(command.format(w=world, out=tmp_path))
-    assert "computing on" not in capsys.readouterr().out
-
-
 # {w} is the folder `world`, {wrong} the folder `wrong`, {out} a folder of the test.
 BENCH = "bench --weights {w}/w.safetensors --scan {w}/lone.bin"
 EVALUATE = "evaluate {w}/data --weights {w}/w.safetensors"

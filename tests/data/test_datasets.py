@@ -343,9 +343,6 @@ def test_a_folder_with_a_description_names_the_yaml_file(tmp_path: Path) -> None
     fails(lambda: open_dataset(str(tmp_path)), "give the YAML file", tmp_path / "mine.yaml")
 
 
-# --- real data ---
-
-
 @pytest.mark.parametrize(
     ("sequences", "train", "val"),
     [
