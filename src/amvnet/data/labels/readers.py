@@ -29,22 +29,13 @@ LARGEST_ID = np.iinfo(np.uint32).max
 ADVICE = "write the labels again, one whole number per point"
 
 
-def read_scan_labels(
-    path: Path,
-    count: int,
-    taxonomy: Taxonomy,
-    field: str | None = None,
-    layout: RowLayout = UNKNOWN,
-) -> np.ndarray:
-    """Read the (N,) uint8 train ids of a scan.
-
-    The arguments are the same as in `read_raw_labels`, and the taxonomy turns raw ids into train
-    ids.
+def read_scan_labels(path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+    """Read the (N,) uint8 train ids of a scan from a label file with raw ids.
 
     Raises:
         InputError: if `read_raw_labels` raises it, or an id is unknown.
     """
-    raw = read_raw_labels(path, count, field, layout, missing=taxonomy.train_to_raw[0])
+    raw = read_raw_labels(path, count, missing=taxonomy.train_to_raw[0])
     return train_ids(path, raw, taxonomy)
 
 

@@ -32,9 +32,7 @@ class Posture:
     torso: float = 0.52
 
 
-def figure(
-    rng: np.random.Generator, label: Label, posture: Posture, surface: Surface = Surface.CLOTH
-) -> Mesh:
+def figure(rng: np.random.Generator, label: Label, posture: Posture) -> Mesh:
     """Return a human body of a random build in a posture."""
     girth = rng.uniform(0.85, 1.35)
     hip_x, hip_z = posture.hip
@@ -59,7 +57,7 @@ def figure(
         clothed.append(tube(shoulder, elbow, 0.055 * girth, 0.045, sides=5))
         clothed.append(tube(elbow, hand, 0.045, 0.04, sides=5))
 
-    return join(part(clothed, surface, label), part(skin, Surface.SKIN, label))
+    return join(part(clothed, Surface.CLOTH, label), part(skin, Surface.SKIN, label))
 
 
 def _joint(start: Vector, end: Vector, reach: float, forward: float) -> Vector:
