@@ -246,13 +246,10 @@ def scores_of_points(
     distance: np.ndarray,
     scores: np.ndarray,
 ) -> np.ndarray:
-    """Return the (P, K) scores of the points, as `RangeImage.to_points` does.
+    """Return the (P, K) scores of points from those of pixels, as `RangeImage.to_points` does.
 
-    Args:
-        view: the range view.
-        image, pixel: what `range_image` returns.
-        distance: (P,) distances of the points from the sensor, metres.
-        scores: (H * W, K) probabilities of the pixels.
+    `image` and `pixel` are what `range_image` returns; `distance` (P,) is in metres, and `scores`
+    are (H * W, K) probabilities.
     """
     own: np.ndarray = scores[pixel]
     if not view.hidden:

@@ -11,13 +11,7 @@ from amvnet.errors import InputError, shown
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers that a field may hold: `Annotated[float, Range(0, 1)]`.
-
-    Attributes:
-        low: lower end of the range.
-        high: upper end of the range.
-        open: whether the range excludes both ends.
-    """
+    """The numbers that a field may hold, such as `Range(0, 1)`; `open` excludes both ends."""
 
     low: float
     high: float = math.inf

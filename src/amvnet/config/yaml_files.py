@@ -36,10 +36,7 @@ def read_yaml(path: Path, content: str) -> Any:
 
 
 def parse_yaml(text: str, expected: str) -> Any:
-    """Return the value of a YAML text. Nothing in it is executed.
-
-    Args:
-        expected: the beginning of error messages.
+    """Return the value of a YAML text; nothing in it is executed. Errors begin with `expected`.
 
     Raises:
         InputError: if the text is not YAML, has aliases or is nested deeply.

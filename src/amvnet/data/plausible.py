@@ -29,14 +29,9 @@ MAX_SHARES = {"two-wheeler": 0.1, "person": 0.1, "pole": 0.2, "vehicle": 0.5}
 
 
 def neighbours(xyz: np.ndarray, labels: np.ndarray, size: int) -> np.ndarray:
-    """Count the points with a labelled neighbour, and those whose neighbour has their label.
+    """Count valid points (N, 3), metres, with a labelled neighbour, and with one of their label.
 
     Neighbours follow each other in the file among the points of one cell.
-
-    Args:
-        xyz: (N, 3) valid points, metres.
-        labels: (N,) train ids, 0..size.
-        size: K, the number of classes.
 
     Returns:
         (2, K + 1) int64, both counts by train id.
@@ -75,8 +70,6 @@ def raised(xyz: np.ndarray, labels: np.ndarray, is_ground: np.ndarray) -> np.nda
     across which the points cover the largest area, in the direction that raises fewer of them.
 
     Args:
-        xyz: (N, 3) valid points, metres.
-        labels: (N,) train ids.
         is_ground: (K + 1,) bool, whether each train id is of the ground.
 
     Returns:

@@ -31,7 +31,6 @@ class Trajectory:
     """The poses of a file or of a topic.
 
     Attributes:
-        name: the file or the topic, for messages.
         poses: (N, 4, 4) float64, each moves points of the sensor into the world.
         times: (N,) seconds, ascending, or None if the file has none.
     """
@@ -148,9 +147,6 @@ def read_poses(path: Path) -> Trajectory:
 
 def timed_poses(name: str, table: NDArray[np.float64]) -> Trajectory:
     """Return the poses of a table (N, 8) of time x y z qx qy qz qw, in seconds and metres.
-
-    Args:
-        name: the file or the topic, for messages.
 
     Raises:
         InputError: if there is no pose, a quaternion has not the length 1, a value is no number, or

@@ -108,7 +108,6 @@ def build_model(
     """Return AMVNet with trained weights, set up for a method; it cannot be trained.
 
     Args:
-        method: how the points are scored, one of `METHODS`.
         tau: the threshold of the assertion, in [0, 1]; by default the threshold of the weights.
 
     Raises:

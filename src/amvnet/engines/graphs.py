@@ -87,13 +87,7 @@ class GraphCheck:
 
 @dataclass(frozen=True)
 class Graph:
-    """A captured network.
-
-    Attributes:
-        input: the tensor from which a replay reads its input.
-        output: the tensor into which a replay writes its output.
-        replay: computes `output` from the current values of `input`.
-    """
+    """A captured network: `replay` computes `output` from the current values of `input`."""
 
     input: Tensor
     output: Tensor

@@ -91,7 +91,6 @@ class OnnxGraph(nn.Module):
     It computes with as many threads as torch would use in the calling thread.
 
     Args:
-        content: the content of the graph's file.
         providers: ONNX Runtime's execution providers, the preferred one first.
         cache: the folder in which TensorRT keeps what it builds; without it, nothing is kept.
     """

@@ -27,12 +27,7 @@ OVERALL = {
 
 
 def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarray:
-    """Count how often each true class was predicted as each class.
-
-    Args:
-        truth: (N,) true train ids, 0..K.
-        prediction: (N,) predicted train ids, 0..K.
-        size: K, the number of classes.
+    """Count how often each true class was predicted as each class, ids (N,) in 0..K = `size`.
 
     Returns:
         (K + 1, K + 1) int64. The row is the true id, the column the predicted id.
@@ -112,11 +107,9 @@ class Evaluation:
     """The confusion counts of any number of scans, for any number of methods.
 
     Attributes:
-        taxonomy: the classes.
         matrices: (bins + 1, K + 1, K + 1) counts by method. The first matrix counts all points.
             Each of the others counts the points between two `EDGES`. Points exactly on an edge are
             in no bin, as in SemanticKITTI's tool.
-        scans: number of scans that were added.
         points: number of points in these scans, labelled or not.
         uncertain: number of uncertain points.
         asked: number of points for which it is known whether they are uncertain.

@@ -61,7 +61,6 @@ class Labeller:
 
     Attributes:
         label: a function that labels a scan by one or several methods.
-        taxonomy: the classes of the labels.
         classes: a map from the classes of the labels, and from the classes of the data, to the
             classes that are scored; None if all three are the same.
         at_once: number of scans that `label` may take at the same time, each in a thread.

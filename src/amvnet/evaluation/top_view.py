@@ -31,13 +31,7 @@ PLAIN = (0.75, 0.75, 0.75)  # colour of points that are not marked, RGB in [0, 1
 
 @dataclass(frozen=True)
 class _Panel:
-    """One view of the scan.
-
-    Attributes:
-        title: the line above the panel.
-        colors: (N, 3) RGB in [0, 1].
-        on_top: (N,) bool, the points that are drawn over all other points.
-    """
+    """One view of the scan: colours (N, 3) in [0, 1]; points `on_top` are drawn over others."""
 
     title: str
     colors: np.ndarray
@@ -50,10 +44,8 @@ class TopView:
 
     Attributes:
         points: (N, 3 or more) x, y, z in metres.
-        taxonomy: names and colours of the classes.
         predictions: (N,) train ids by title.
         truth: (N,) train ids of the ground truth.
-        title: a line above all panels.
         uncertain: (N,) bool, the uncertain points; None if they are unknown.
     """
 

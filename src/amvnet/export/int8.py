@@ -68,7 +68,6 @@ def quantise(
     scan serves for both.
 
     Args:
-        folder: the output folder of `amvnet export`.
         names: the graphs to quantise, all of them in `KEEPS_FIRST_LAYER`.
         scans: the scans, prepared for the networks (`Expectation.prepare`).
 

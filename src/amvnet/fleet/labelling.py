@@ -60,7 +60,6 @@ class LabelScans:
 
     Args:
         request: how the scans are labelled, and which files are written.
-        out: the URL or the path of the output folder.
         compute: the device, and the number of scans that are computed at the same time. The engine
             and the precision are in the request.
         batch: the number of scans that go through the networks together.

@@ -89,7 +89,6 @@ def label_fleet(
 
     Args:
         inputs: the scans, as `list_scans` takes them.
-        out: the URL or the path of the output folder.
         report: takes lines about what was assumed of the sensors, and how sure the labels are.
 
     Returns:
@@ -139,11 +138,9 @@ class FleetRun:
     """A run over the scans of a fleet, window by window: plan, measure the drives, label.
 
     Args:
-        request: how the scans are labelled.
         results: the table of results; it knows the scans that an earlier run has done.
         resources: the resources of each worker, as options of Ray.
         progress: called with the number of scans that are done, and their total so far.
-        report: takes lines for the user.
     """
 
     def __init__(

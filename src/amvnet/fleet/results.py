@@ -78,10 +78,6 @@ class Results:
     error, and its label file exists. When a run is resumed, the rows of all other scans are
     removed, so that each scan has one row.
 
-    Args:
-        request: how the scans are labelled.
-        resume: whether to continue an earlier run.
-
     Attributes:
         done: the names of the scans that an earlier run has done.
         estimates: the `estimates` of `describe_drive`, for each drive that is measured.

@@ -19,11 +19,9 @@ class Entry(NamedTuple):
     """A scan that is done.
 
     Attributes:
-        scan: the name of the scan.
         origin: a digest of the size and time of its file, and of the first files of its recording,
             on which the sensor is measured.
         sensor: the name of the recording, whose scans have one sensor.
-        points: the number of valid points.
         uncertain: the number of uncertain points: `points` times `Segmentation.doubt`.
         counts: the number of points of each train id that was written, from 0.
     """

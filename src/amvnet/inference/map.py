@@ -23,13 +23,7 @@ SAVED_SCANS = 50  # number of scans after which the unfinished map is saved agai
 
 @dataclass(frozen=True)
 class SavedMap:
-    """Where an unfinished map is saved.
-
-    Attributes:
-        path: the file.
-        request: a text that tells the map from others.
-        resume: whether to continue the map that the file holds.
-    """
+    """Where an unfinished map is saved; `request` tells it from others, `resume` continues it."""
 
     path: Path
     request: str

@@ -44,7 +44,6 @@ class OutputOptions:
     """The choice of files that are written for each scan.
 
     Attributes:
-        folder: the folder of predictions.
         kind: the format of the labels of scan files, one of `writers.KINDS`; datasets have their
             own format.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
@@ -87,9 +86,6 @@ class Pipeline:
     """Reads, segments and writes scans at the same time, into files that `check_output` allows.
 
     Attributes:
-        scans: the scans to segment.
-        segment: segments scans that have been read.
-        output: which files are written, and where.
         batch: the number of scans that go through the networks together; it changes labels only by
             rounding.
         at_once: the number of batches that are segmented at the same time, each with its share of

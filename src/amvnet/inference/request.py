@@ -28,9 +28,7 @@ class LabellingRequest(Checked):
     """A request for labels: it holds all that label files depend on, except the scans themselves.
 
     Attributes:
-        weights: trained weights.
         method, tau, precision: as `amvnet.load` takes them.
-        engine: the name of the engine that runs the networks.
         sensor: what is known about the sensor of scan files; the rest is measured.
         layout: the names of the columns in files that do not name them.
         topic: the topic to read in bags; None selects the only one with scans.

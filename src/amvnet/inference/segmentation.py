@@ -94,8 +94,6 @@ class Origin:
 
     Attributes:
         scan: the scan, normalised to the weights.
-        taxonomy: the classes of the labels.
-        method: the method that gave the labels.
         usual_uncertain: the share of uncertain points in the validation of the weights, in [0, 1];
             None if it is not known for this tau.
         path: the file of the scan; None if the scan was in memory.
@@ -317,10 +315,7 @@ def fetch(scores: Scores) -> tuple[Tensor, Scores]:
 def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> Segmentation:
     """Return the result for one scan of a batch.
 
-    Args:
-        valid: (N,) bool, the scan's valid points.
-        labels: (P,) train ids of all points in the batch.
-        points: the places of the scan's valid points in the batch.
+    Of its points, `valid` (N,), the valid ones have the places `points` in the batch.
     """
     return Segmentation(
         labels=expand_to_scan(labels[points], valid),
@@ -342,8 +337,6 @@ def scores_by_method(
     AMVNet and the ensembles include all ensembles and each single network.
 
     Args:
-        scores: the scores by `method`.
-        names: the methods to return; methods that `method` does not include are left out.
         vote: returns the scores by rv-knn, given the scores of the range view.
     """
     f = scores.rv

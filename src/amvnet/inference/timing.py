@@ -36,12 +36,9 @@ FIGURES = Signature("figures of bench", rb'\{\s*"engine": ')
 
 @dataclass(frozen=True)
 class Timing:
-    """The time of one run.
+    """The time of one run: the seconds of each of the `STAGES`, and of `MEAN`.
 
-    Attributes:
-        seconds: the seconds of each of the `STAGES`, and of `MEAN`.
-        points: the number of valid points.
-        uncertain: the number of uncertain points.
+    `points` counts the valid points.
     """
 
     seconds: dict[str, float]

@@ -84,13 +84,9 @@ def _nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
 def _search(
     query: Query, xyz: np.ndarray, own: np.ndarray, rows: np.ndarray, nearest: np.ndarray
 ) -> np.ndarray:
-    """Write R rows of `nearest`, the result of `nearest_others`, `QUERIES_AT_ONCE` at a time.
+    """Write the rows (R,) of `nearest` (U, n), `QUERIES_AT_ONCE` at a time.
 
-    Args:
-        xyz: (P, 3), all points of the scan, metres.
-        own: (U,) indices of the points whose neighbours are wanted.
-        rows: (R,) indices of the rows to write.
-        nearest: (U, n), the result.
+    The other arguments and the result are those of `nearest_others`.
 
     Returns:
         (R,) bool, whether the last neighbour of each row has a tie; see `Query`.
@@ -138,10 +134,6 @@ def _drop_self(nearest: np.ndarray, index: np.ndarray, n: int) -> np.ndarray:
     The nearest points come first. If fewer than n are left, the last of them is repeated. If many
     points coincide, a point may not be among its own nearest points. Then the last of them is
     dropped instead.
-
-    Args:
-        nearest: (U, m) indices of the nearest points of each point.
-        index: (U,) indices of the points themselves.
     """
     if nearest.shape[1] > 1:
         if (nearest[:, 0] == index).all():  # usually, no points coincide

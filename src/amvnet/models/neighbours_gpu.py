@@ -51,10 +51,6 @@ def nearest_others_by_blocks(xyz: Tensor, own: Tensor, n: int) -> Tensor:
 
     `amvnet.models.neighbours.nearest_others` returns the same points, except that it may choose
     others among equally near points. The tensors stay on their device.
-
-    Args:
-        xyz: (P, 3), all points of the scan, metres.
-        own: (U,) indices of the points whose neighbours are wanted.
     """
     others = min(n, len(xyz) - 1)
     if not len(own) or others < 1:

@@ -51,14 +51,10 @@ class PointHead(nn.Module):
         return self._logits(_pool(encoded), point)
 
     def classify(self, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
-        """Return (U, K) class probabilities of some points of one scan.
+        """Return (U, K) class probabilities of the points `index` (U,) of one scan (P, 4).
 
-        Args:
-            points: (P, 4), all points of the scan.
-            f: (P, K) class probabilities of all points by the range view's network.
-            g: (P, K) class probabilities of all points by the bird's-eye view's network.
-            index: (U,) indices of the points to classify.
-            near: (U, n) indices of their neighbours.
+        All its points have the probabilities f and g (P, K); `near` (U, n) holds indices of
+        neighbours.
         """
         h = f.new_empty(len(index), f.shape[1])
         for part in sectors(points, index):
@@ -71,11 +67,6 @@ class PointHead(nn.Module):
 
         The first layer W is linear: W [f_k, g_k, x_k - x_i] = W [f_k, g_k, x_k] - W [0, 0, x_i]. So
         it is computed once for each point, not once for each neighbour of each point.
-
-        Args:
-            table: (P, 2 K + 4), the `point_table` of one scan.
-            uncertain: (U,) indices of the uncertain points.
-            near: (U, n) indices of their nearest neighbours.
         """
         first = self.mlp[0]
         rest = self.mlp[1:]
@@ -126,10 +117,6 @@ def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
 
     Points of similar azimuth share neighbours, so that the points of a part have few neighbours
     together.
-
-    Args:
-        points: (P, 4), all points of the scan.
-        index: (U,) indices of the points to divide.
 
     Returns:
         For each part, the places of its points in `index`: at most `POINTS_AT_ONCE` places.

@@ -20,12 +20,7 @@ PART_ON_GPU = 2**18  # number of points encoded at a time on a GPU, which keep i
 class PolarNet(nn.Module):
     """The network that takes a `PolarGrid` and returns the logits of its M occupied pillars.
 
-    The logits are (M, Z * K): K logits for each of the Z voxels of a pillar.
-
-    Args:
-        config: the sizes of the network.
-        vertical: Z, number of voxels in a pillar.
-        classes: K, number of classes.
+    The logits are (M, Z * K): K (`classes`) for each of the Z (`vertical`) voxels of a pillar.
     """
 
     def __init__(self, config: PolarNetConfig, vertical: int, classes: int) -> None:

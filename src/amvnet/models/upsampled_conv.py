@@ -71,11 +71,6 @@ def _convolve_upsampled(x: Tensor, kernels: Tensor, scale: tuple[int, int]) -> T
     The width is padded circularly. The fine cell s * t + p, with p from -1 to s - 2, sees the
     coarse cells t - 1 and t. So there is one kernel of 2 taps for each p. Because p begins at -1,
     the row of results begins one fine cell before the map.
-
-    Args:
-        x: (B, C, h, w), the coarse map.
-        kernels: the kernels that `_kernels` returns for `scale`.
-        scale: s along the height and along the width.
     """
     rows, columns = scale
     output = convolve(wrap_width(x, 1, 1), kernels, None, stride=(1, 1), padding=(1, 0))

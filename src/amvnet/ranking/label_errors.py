@@ -60,7 +60,6 @@ class PointDoubts:
     """How doubtful the label of each of the N points of a scan is.
 
     Attributes:
-        xyz: (N, 3) coordinates, metres.
         doubt: (N,) float32, in [0, 1]; 0 for points that are not doubted.
         rv: (N,) train ids predicted by the range view.
         bev: (N,) train ids predicted by the bird's-eye view.
@@ -85,10 +84,7 @@ def rank(
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> np.ndarray:
-    """Return the doubtful clusters of some labelled scans, the most doubtful cluster first.
-
-    Returns:
-        (C,) rows of `ROW`.
+    """Return the doubtful clusters of some labelled scans, (C,) of `ROW`, most doubtful first.
 
     Raises:
         InputError: if the weights lack a network or do not have the dataset's classes, or a scan

@@ -32,9 +32,7 @@ class Processes:
 
     Attributes:
         rank: this process's number among all processes, from 0.
-        size: number of processes.
         local_rank: this process's number among the processes on its machine, from 0.
-        nodes: number of machines.
         group: torch's process group for the exchange of Python objects; None if there is only one
             process.
     """

@@ -103,10 +103,9 @@ class Frame:
 
 
 def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
-    """Find the frame of a scan.
+    """Find the frame of a scan with finite coordinates (N, 3), without lost points.
 
     Args:
-        xyz: (N, 3) finite coordinates of the file, without lost points.
         sensor: what the user described; only the rest is estimated.
 
     Raises:

@@ -58,16 +58,12 @@ class Ground:
 
 
 def find_ground(xyz: NDArray[np.floating]) -> Ground | None:
-    """Find the ground of a scan whose z axis points more or less up.
+    """Find the ground of a scan, (N, 3) finite points in metres, whose z axis points about up.
 
     Many planes through three low points are tried. The ground is the plane with many low points in
     it and few below it. Least squares refine it. Near points count more.
 
-    Args:
-        xyz: (N, 3) finite points, metres.
-
-    Returns:
-        The ground, or None if no plane is good enough.
+    None says that no plane is good enough.
     """
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
     around = xyz[(distance > MIN_DISTANCE) & (distance < MAX_DISTANCE)]

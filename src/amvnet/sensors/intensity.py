@@ -265,7 +265,6 @@ def fill_intensity(scan: Scan, trained: TrainedIntensity | None) -> tuple[Scan, 
     missing, the scan becomes one without intensities: real ones among many zeros would mislead.
 
     Args:
-        scan: a scan; intensities that are not finite are missing.
         trained: the intensities of the training, or None if these are unknown.
 
     Returns:

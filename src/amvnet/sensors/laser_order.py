@@ -30,9 +30,6 @@ def lasers_by_order(points: np.ndarray, lasers: int) -> np.ndarray | None:
     at the front (+x) and turns to the left. So the next laser begins where the azimuth passes the
     front from right to left. The order counts only if it gives exactly as many lasers as the sensor
     has, and each laser keeps to one elevation, below the laser before it.
-
-    Args:
-        points: (N, 3 or more) x, y, z in metres, in the order of the file.
     """
     if len(points) < MIN_POINTS * lasers:
         return None

@@ -90,14 +90,9 @@ def _is_near(angle: float | None, other: float | None) -> bool:
 
 
 def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:
-    """Measure the sensor of a scan.
+    """Measure the sensor of a scan; values that the points do not show are None.
 
-    Args:
-        points: (N, 3 or more) finite x, y, z in the sensor's frame, in the order of the file.
-        ring: (N,) index of each point's laser, or None if the file has no rings.
-
-    Returns:
-        The geometry; values that the points do not show are None.
+    The points (N, 3 or more) are finite, in the sensor's frame and in the order of the file.
     """
     lasers = measure_lasers(points, ring)
     if lasers.fov_up is None:

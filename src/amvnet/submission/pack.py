@@ -38,12 +38,9 @@ def write(
     scores or other splits, are left out. Only one scan at a time is in memory.
 
     Args:
-        folder: folder with the predictions, under the file names of `rules`.
         out: the archive, NAME.zip. It appears whole or not at all.
         use_external: whether the method also learnt from data outside the benchmark. Only archives
             for nuScenes state it.
-        progress: called before each file and at the end, with the number of files that are done and
-            their total.
 
     Raises:
         InputError: if a prediction is missing or breaks the rules, or the archive cannot be

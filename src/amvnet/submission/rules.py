@@ -72,7 +72,6 @@ def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = No
     """Return the rules for the archive of one split, or of some sequences.
 
     Args:
-        dataset: the dataset, whose scans decide which predictions are required and their sizes.
         split: a split. The servers score "test"; other splits are for trials.
         sequences: sequences or scenes to pack instead of a split.
 

@@ -122,19 +122,12 @@ def paste(scan: Scan, other: Scan, classes: Sequence[int], rng: np.random.Genera
 
 
 def disturb(scores: Tensor, points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Make the scores of one network for a scan less certain, and wrong in places.
+    """Make the scores (P, K) of one network for a scan less certain, and wrong in places.
 
     All probabilities are softened by one softmax temperature. Then some classes lose a part of
     their probability to another class. They lose more in some directions and at some ranges than
     elsewhere. The scores then resemble scores on scans unlike the networks' training scans, so the
     head learns to trust the networks less.
-
-    Args:
-        scores: (P, K) probabilities.
-        points: (P, 4) x, y, z in metres, and intensity.
-
-    Returns:
-        (P, K) probabilities.
     """
     temperature = float(np.exp(rng.uniform(0, np.log(HIGHEST_TEMPERATURE))))
     softened = scores.clamp_min(1e-7).log().div(temperature).softmax(dim=1)

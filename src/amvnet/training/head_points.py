@@ -107,12 +107,9 @@ class PointSampler(EpochOrder):
     full is left out, because the statistics of a few points would harm batch norm.
 
     Args:
-        labels: (U,) train ids of the points.
         config: the number of points in a batch and in an epoch. To balance the classes, a point of
             a class with n points is drawn with a probability proportional to n ** -balance. It may
             then be drawn several times.
-        seed: the seed of the random order.
-        processes: the processes that share the batches.
     """
 
     def __init__(

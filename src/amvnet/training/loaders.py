@@ -49,10 +49,8 @@ class ScanSet(data.Dataset[Scan]):
     any number of processes.
 
     Args:
-        scans: the scans to train on.
         expects: what the networks expect of a scan, before its augmentation.
         augment: how the scans are augmented, or None to leave them unchanged.
-        seed: the seed of the augmentation.
     """
 
     def __init__(
@@ -178,7 +176,6 @@ def make_loader(
     Args:
         workers: number of processes that read scans; 0 reads them in this process.
         shuffle: whether an `EpochSampler` draws the scans of each epoch, as in training.
-        processes: the processes that share the scans.
     """
     sampler: data.Sampler[Any] | list[Key] = EpochSampler(len(scans), scans.seed, processes)
     if not shuffle:

@@ -25,16 +25,10 @@ MIN_ERROR = 1e-3
 
 
 def class_weights(counts: NDArray[np.number]) -> NDArray[np.float32]:
-    """Return the square roots of the inverse class frequencies, scaled to a mean of 1.
+    """Return the square roots (K,) of the inverse frequencies of the classes, with a mean of 1.
 
     Frequencies below `FREQUENCY_FLOOR` are raised to it; the frequency of an absent class is 0.
     This is section 4.2 of the paper.
-
-    Args:
-        counts: (K,) number of points of each class in the training data.
-
-    Returns:
-        (K,) float32.
     """
     frequency = np.maximum(counts / max(counts.sum(), 1), FREQUENCY_FLOOR)
     weights = 1 / np.sqrt(frequency)
@@ -164,9 +158,7 @@ def distillation_loss(scored: Scored, teacher: Tensor, rivals: Tensor) -> Tensor
     follows learning without forgetting (Li and Hoiem, 2016).
 
     Args:
-        scored: the points, pixels or voxels, with sources.
         teacher: (P, K) logits of the initial network for the same points.
-        rivals: (M, K) bool, as `network_loss` takes it.
 
     Returns:
         The loss: a scalar. The loss of a scan without points of such a dataset is 0.
@@ -190,19 +182,10 @@ def distillation_loss(scored: Scored, teacher: Tensor, rivals: Tensor) -> Tensor
 
 
 def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> Tensor:
-    """Return the most frequent train id of the points in each cell.
+    """Return the most frequent train id of the points in each of `count` cells; 0 without labels.
 
     Points without a label (id 0) count only if their cell has no others. If ids are equally
     frequent, the lowest one is returned.
-
-    Args:
-        cells: (P,) int64 cell of each point, 0..count - 1.
-        labels: (P,) int64 train ids, 0..classes.
-        count: M, the number of cells.
-        classes: K.
-
-    Returns:
-        (M,) int64 train ids; 0 for a cell without labelled points.
     """
     ids = classes + 1
     points = torch.bincount(cells * ids + labels, minlength=count * ids).view(count, ids)
@@ -216,12 +199,8 @@ def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> 
 def dice(probabilities: Tensor, targets: Targets) -> Tensor:
     """Return the soft Dice loss: 1 - 2 |p t| / (|p| + |t|), averaged over the classes present.
 
-    Args:
-        probabilities: p, (P, K).
-        targets: the labels; t is their one-hot encoding.
-
-    Returns:
-        The mean over the scans, a scalar.
+    p are the probabilities (P, K), and t is the one-hot encoding of the labels. The result is the
+    mean over the scans.
     """
     truth = F.one_hot(targets.classes, probabilities.shape[1]).to(probabilities)
     members = F.one_hot(targets.scan, len(targets.counts)).to(probabilities).T  # (B, P)

@@ -49,14 +49,11 @@ class NetworkStage(Stage):
     A subclass defines `compare` and `score`.
 
     Args:
-        view: the projection.
-        net: the network, which takes what the projection returns.
         weights: (K,) class weights of the loss, or None for equal weights.
         rivals: (M, K) bool, which classes the points of each dataset count against
             (`rival_classes`), or None for all.
         teacher: the initial network, if its probabilities are to be kept for the classes that a
             dataset lacks (`distillation_loss`).
-        shared: the arguments of `Stage`.
     """
 
     config: NetworkTraining
@@ -163,9 +160,6 @@ class NetworkStage(Stage):
 
         Lightning divides the loss of each part of a batch by the number of parts. The last batch
         of an epoch may have fewer parts, and its last part may have fewer scans.
-
-        Args:
-            index: index of this part in the epoch, from 0.
         """
         parts = self.trainer.accumulate_grad_batches
         loader = self.trainer.train_dataloader
@@ -265,9 +259,6 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tenso
 
 def train_network(plan: Plan, checked: Checked, name: str, weights: Weights) -> None:
     """Train a network in the stage `rv` or `bev`, and write its weights after each epoch.
-
-    Args:
-        name: the stage, "rv" or "bev".
 
     Raises:
         InputError: if the weights do not fit the recipe, a scan is broken, or the memory of the GPU

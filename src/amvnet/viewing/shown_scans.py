@@ -38,7 +38,6 @@ class ShownScan:
     Attributes:
         name: the scan's short name, for people.
         points: (N, 4) float32 x, y, z in metres and intensity in [0, 1].
-        valid: (N,) bool, the points that have a position.
         truth: (N,) train ids of the ground truth; None if there is no ground truth.
         labels: (N,) train ids by method; the key of labels from files is "labels".
         probabilities: (N,) float32 in [0, 1] by method, the probability of the method's own label.

@@ -15,13 +15,7 @@ NAME_PART = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,94}[A-Za-z0-9_])?", re.
 
 
 def fetch(name: str) -> Path:
-    """Download a weights file, or find it in the cache of the hub's client.
-
-    Args:
-        name: `hf-hub:OWNER/NAME` or `hf-hub:OWNER/NAME@REVISION`.
-
-    Returns:
-        The path of the file in the cache.
+    """Download a weights file, or find it in the cache of the hub's client; return its path.
 
     Raises:
         InputError: if there are no such weights, the hub cannot be reached, or its client is not

@@ -27,10 +27,6 @@ def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
 
     They expect the scans of the other weights, to which the part was trained last.
 
-    Args:
-        part: "range_net", "polar_net" or "point_head".
-        other: the weights that have the new part.
-
     Raises:
         InputError: if the other weights lack the part or have other classes.
     """

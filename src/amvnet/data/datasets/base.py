@@ -31,7 +31,6 @@ class ScanRecord:
     Attributes:
         name: unique in its dataset: "08/000001", or the sample_data token.
         sequence: "08", or the name of the scene.
-        points_path: the file of the points.
         labels_path: the file of the labels, or None if the sequence has none.
         prediction: path of the scan's prediction, relative to a folder of predictions.
     """
@@ -52,7 +51,6 @@ class Dataset(ABC):
     """One dataset on disk; instances can be pickled, so that worker processes can read.
 
     Attributes:
-        root: the folder that was opened.
         taxonomy: the classes of the labels.
         spec: the text by which `open_dataset` opens the same dataset; by default the folder.
         readers: number of threads that may read scans at the same time.

@@ -62,10 +62,7 @@ class Description:
     """What the YAML file of a dataset says.
 
     Attributes:
-        path: the path of the YAML file.
         root: the folder that all other paths are relative to.
-        taxonomy: the classes.
-        scans: the pattern of the scan files.
         labels: where the labels are; None if there are none.
         unread: the classes of the labels, if they are not the classes in `taxonomy`. Such labels
             are not read.

@@ -26,10 +26,6 @@ class OwnScans(Dataset):
 
     A scan's sequence is the first folder below the part of the pattern that has no wildcards. If
     the split cuts through a folder, its parts are sequences: `site-train`, `site-val`.
-
-    Args:
-        description: what the YAML file says.
-        normalise: makes scans of the points in the files; without it, points stay unchanged.
     """
 
     def __init__(

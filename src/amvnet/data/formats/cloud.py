@@ -52,7 +52,6 @@ class Cloud:
         xyz: (N, 3) float32 or float64 coordinates, metres.
         intensity: (N,) intensities in the file's own range; None if the file has no intensities.
         ring: (N,) int64 index of the laser; None if the file has no rings.
-        name: the source of the scan, for messages.
         note: what the reader had to assume about the file; empty if it assumed nothing.
     """
 

@@ -19,12 +19,9 @@ HEADER = 65_536  # the longest header of a file, bytes
 
 @dataclass(frozen=True)
 class Fields:
-    """The fields of a record, in order.
+    """The fields of a record, in order; several may have the same name.
 
-    Attributes:
-        names: the name of each field; several fields may have the same name.
-        dtypes: the NumPy type of each field, with the byte order.
-        counts: the number of values of each field.
+    `dtypes` has the byte order, `counts` the number of values of each field.
     """
 
     names: Sequence[str]

@@ -41,10 +41,8 @@ class NamedScan:
         name: the scan's name, unique in one input: `000000` for the file `000000.bin`,
             `drive/000000` for the first scan of the bag `drive.bag`.
         source: the recording's name: the bag, or the folder and the ending of its files.
-        path: the file or the bag.
         ending: the ending that belongs to the file's content (`ending_of`); empty for a broken
             file.
-        read: reads the scan.
         bag_poses: reads the poses of all scans of a bag; None for a file.
     """
 
@@ -99,7 +97,6 @@ def list_scans(
     scan, and reading this scan raises the error.
 
     Args:
-        path: a file, a folder or a pattern, as `find_scans` takes it.
         topic: the topic to read in bags; by default the only one with scans.
         is_alone: whether the user names no other path.
 

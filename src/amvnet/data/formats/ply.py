@@ -34,14 +34,9 @@ ADVICE = "write the file again"
 
 @dataclass
 class Element:
-    """One element of a file, such as `vertex`.
+    """An element of a file, such as `vertex`, with `count` rows.
 
-    Attributes:
-        name: the name of the element.
-        count: the number of rows.
-        properties: the names of the properties.
-        types: the types of the properties; "list", and the types of its length and of its items,
-            for a list.
+    The type of a list is "list", and the types of its length and of its items.
     """
 
     name: str

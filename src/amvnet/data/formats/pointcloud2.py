@@ -25,10 +25,7 @@ TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def read_message(message: Any, name: str) -> Cloud:
-    """Return the points of a deserialised message, row by row, without the padding.
-
-    Args:
-        message: any object with the attributes of PointCloud2.
+    """Return the points of a message of PointCloud2, row by row, without the padding.
 
     Raises:
         InputError: if x, y or z is missing, or the data are shorter than the message claims.

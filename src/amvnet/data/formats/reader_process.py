@@ -53,7 +53,6 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
 
     Args:
         function: a function of a module, which returns arrays and values that JSON can hold.
-        path: the first argument of the function: a file, or a folder of files.
         arguments: the other arguments, which JSON has to hold.
 
     Raises:

@@ -117,12 +117,7 @@ def describe(columns: Sequence[str]) -> str:
 def named_cloud(
     columns: Sequence[np.ndarray], names: Sequence[str], name: str, note: str = ""
 ) -> Cloud:
-    """Return a cloud from columns (N,) with the names of a `RowLayout`.
-
-    Args:
-        columns: the columns, (N,) each.
-        names: the names of the columns; more columns than names are left out.
-        name: the source of the scan, for messages.
+    """Return a cloud from columns (N,) with names of a `RowLayout`; further columns are left out.
 
     Raises:
         InputError: if there are fewer columns than names, or a column does not hold numbers.

@@ -228,10 +228,7 @@ def _cells(fractions: Tensor, cells: int) -> Tensor:
 def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tensor:
     """Return the index of the nearest point in each pixel: (pixels,) int32, -1 for no point.
 
-    Args:
-        distance: (P,) distance of each point, metres.
-        pixel: (P,) pixel of each point.
-        least: smallest distance of a point that counts, metres.
+    Points (P,) nearer than `least` metres do not count.
     """
     # The bits of floats >= 0 have the order of the floats. So if integers hold a distance in their
     # upper half and an index in their lower half, their minimum gives the nearest point.
