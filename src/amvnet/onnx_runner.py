@@ -125,7 +125,6 @@ class OnnxSegmenter:
         )
 
     def _check_sizes(self, folder: Path, k: int) -> None:
-        """Raise InputError if the sizes of the graphs differ from those in the description."""
         image = self.range_view
         grid = self.polar_view
         expected_sizes = {
@@ -372,7 +371,6 @@ def _cells(share: NDArray[np.floating], cells: int) -> NDArray[np.int64]:
 
 
 def _check_rings(ring: np.ndarray, height: int) -> None:
-    """Raise InputError if one of the rings (P,) is unknown or out of range."""
     if ring.min() < 0:
         raise InputError(
             "expected a scan with a ring index, found none; use a model with rows by elevation"
@@ -482,7 +480,6 @@ def open_session(path: Path, content: bytes, providers: Sequence[str]) -> Any:
 
 
 def _open_graph(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -> Any:
-    """Open a graph in ONNX Runtime; raise InputError if it differs from the description."""
     path = folder / graph["file"]
     session = open_session(path, read_graph(folder, graph), providers)
     inputs = [(value.name, value.shape) for value in session.get_inputs()]

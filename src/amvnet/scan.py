@@ -58,7 +58,6 @@ class Scan:
         self._check_count("sources", self.source)
 
     def _check_count(self, kind: str, values: np.ndarray | None) -> None:
-        """Raise InputError unless there is one value per point, or no values at all."""
         if values is None or values.shape == (len(self.points),):
             return
 

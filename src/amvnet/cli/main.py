@@ -172,7 +172,6 @@ def _parse_with_recipe(command: str, arguments: Sequence[str]) -> dict[str, Any]
 
 
 def _has_several_processes() -> bool:
-    """Return whether torchrun or SLURM has started several processes."""
     if not {"WORLD_SIZE", "SLURM_STEP_ID"} & set(os.environ):
         return False
     from amvnet.runtime.distributed import started  # imports torch

@@ -82,11 +82,9 @@ class Parser(argparse.ArgumentParser):
         return values
 
     def _flags(self) -> list[str]:
-        """Return the names of all options."""
         return [known for action in self._actions for known in action.option_strings]
 
     def _wrong_option(self) -> str | None:
-        """Return the first word that looks like an option but is unknown, or None."""
         for word in self._words:
             if word == "--":
                 break
@@ -222,12 +220,10 @@ def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
 
 
 def _is_bundle(kind: Any) -> bool:
-    """Return whether a type is a dataclass, so that its fields are options."""
     return isinstance(kind, type) and dataclasses.is_dataclass(kind)
 
 
 def _add_argument(parser: Parser, name: str, kind: Any, metavar: str, text: str) -> None:
-    """Add a positional-only parameter of a command to the parser."""
     nargs = None
     if get_origin(kind) is list:
         nargs = "+"

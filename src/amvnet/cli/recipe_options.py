@@ -82,7 +82,6 @@ def _walk(config: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _to_text(value: Any) -> str:
-    """Return the text of a value as users write it."""
     if isinstance(value, tuple):
         return "[" + ",".join(map(str, value)) + "]"
     return str(value).lower() if isinstance(value, bool) else str(value)

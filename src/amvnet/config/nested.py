@@ -98,7 +98,6 @@ def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
 
 
 def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
-    """Convert a value to the type of a field."""
     wrong_type = InputError(
         f"{where}: expected a value like {default!r}, found {shown(value)}; correct the value"
     )

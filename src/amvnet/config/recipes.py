@@ -80,7 +80,6 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
 
 
 def _find(name_or_path: str) -> Path:
-    """Return the path of a recipe."""
     if name_or_path in recipe_names():
         return Path(str(_FOLDER)) / f"{name_or_path}.yaml"
 

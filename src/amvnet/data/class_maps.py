@@ -72,7 +72,6 @@ def class_map(name: str) -> ClassMap:
 
 
 def _parse(name: str, tree: Any) -> ClassMap:
-    """Return the map that a YAML file describes."""
     classes = tree.get("classes") if isinstance(tree, Mapping) else None
     entries = class_entries(classes, "from", "ground: [road, sidewalk]")
 

@@ -296,7 +296,6 @@ def _rgb(values: Iterable[Any]) -> Color:
 
 
 def _built_in() -> dict[str, Taxonomy]:
-    """Return the taxonomies of both benchmarks by name."""
     text = (resources.files("amvnet.data") / "benchmarks.toml").read_text(encoding="utf-8")
 
     taxonomies = {}

@@ -176,7 +176,6 @@ def _percent(value: float | None) -> float | None:
 
 
 def _figure(title: str) -> tuple[Any, Any]:
-    """Return an empty Matplotlib figure with a title, and its axes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=SIZE, layout="constrained")
@@ -189,7 +188,6 @@ def _figure(title: str) -> tuple[Any, Any]:
 def _write(
     path: Path, columns: Sequence[str], rows: Sequence[Sequence[Cell]], figure: Any = None
 ) -> list[Path]:
-    """Write the rows as CSV, and the figure as PNG if there is one."""
     csv_path = path.with_suffix(".csv")
     with atomic_write(csv_path) as part, part.open("w", newline="") as file:
         csv.writer(file).writerows([columns, *rows])

@@ -161,7 +161,6 @@ def pictures_of(records: Sequence[ScanRecord], folder: Path) -> dict[Path, Signa
 
 
 def _pictured(records: Sequence[ScanRecord]) -> Sequence[ScanRecord]:
-    """Return the scans that are drawn."""
     return evenly_spaced(records, MAX_PICTURES)
 
 

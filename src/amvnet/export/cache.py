@@ -70,7 +70,6 @@ def cached_networks(
 
 
 def _key(weights: Weights, int8: str | None) -> str:
-    """Return the name of the folder of an export."""
     digests = [weights.digest(part) for part in weights.parts]
     key = [*digests, repr(weights.model), version("amvnet"), torch.__version__]
     if int8 is not None:

@@ -110,7 +110,6 @@ class LabelScans:
         return rows
 
     def _label(self, drive: Sequence[Row]) -> list[Row]:
-        """Label scans of one drive."""
         start = time.perf_counter()
         for row in drive:
             check_outside(Place.of(row["path"]), self._out)
@@ -240,7 +239,6 @@ def _read_fetched(fetching: Future[Path], request: LabellingRequest) -> Cloud:
 
 
 def _complete(row: Row) -> Row:
-    """Return the row of a scan with all columns; unknown values are empty."""
     name = row.get("name") or split_name(Path(row["path"]).name)[0]
     others = {key: row.get(key) or "" for key in ("drive", "estimates")}
     return {"path": row["path"], "name": name, **others}

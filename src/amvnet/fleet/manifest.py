@@ -60,7 +60,6 @@ class NameSet:
 
 
 def _digests(names: Sequence[str]) -> NDArray[np.uint64]:
-    """Return (N,) uint64 digests of names."""
     content = [blake2b(name.encode(errors="surrogatepass"), digest_size=8) for name in names]
     return np.frombuffer(b"".join(each.digest() for each in content), np.uint64)
 
@@ -102,7 +101,6 @@ def list_scans(inputs: Iterable[str], out: Place) -> Iterator[pa.Table]:
 
 
 def _list_input(place: Place, out: Place) -> Iterator[pa.Table]:
-    """Yield the scans of an input."""
     kind = place.kind()
     if kind == FileType.NotFound:
         raise InputError(
@@ -177,7 +175,6 @@ def _as_path(name: str) -> str:
 
 
 def _read_manifest(place: Place) -> Iterator[pa.Table]:
-    """Yield the scans of a manifest."""
     folder = place.address.rpartition("/")[0]
     for rows in _read_rows(place):
         yield pa.Table.from_pylist([_resolve(row, folder) for row in rows], SCANS_SCHEMA)

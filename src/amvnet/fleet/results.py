@@ -193,7 +193,6 @@ class Results:
 
 
 def _read(place: Place, schema: pa.Schema) -> pa.Table:
-    """Read a table that has the columns of a schema, and no null in the first column."""
     with reaching(place.url):
         table = pa.parquet.read_table(BytesIO(place.read()))
     found = ""
@@ -215,7 +214,6 @@ def _read(place: Place, schema: pa.Schema) -> pa.Table:
 
 
 def _replace(place: Place, table: pa.Table) -> None:
-    """Write a table, or remove its file if it has no rows."""
     if not len(table):
         place.remove()
         return
@@ -225,7 +223,6 @@ def _replace(place: Place, table: pa.Table) -> None:
 
 
 def _check_empty(out: Place) -> None:
-    """Raise InputError if a folder is not empty."""
     if out.kind() != FileType.Directory:
         return
     files, folders = out.children()
@@ -236,7 +233,6 @@ def _check_empty(out: Place) -> None:
 
 
 def _check_same(place: Place, settings: Mapping[str, Any]) -> None:
-    """Raise InputError if the file of an earlier run holds other settings."""
     content = place.read()
     earlier = None
     with suppress(ValueError, RecursionError):  # no text, no JSON, or a number with too many digits

@@ -137,7 +137,6 @@ def _to_line(value: Any) -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[Entry]]:
-    """Return the settings and the entries of a journal; settings that cannot be read are empty."""
     lines = path.read_text(errors="replace").splitlines(keepends=True)
     settings = _from_line(lines[0]) if lines else None
     if not isinstance(settings, dict):

@@ -367,7 +367,6 @@ def _size_and_time(path: Path) -> tuple[int, int]:
 
 
 def _key(scan: InputScan) -> str:
-    """Return the name of a scan in the journal."""
     return str(scan.scores_path)
 
 

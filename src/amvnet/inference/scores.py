@@ -121,7 +121,6 @@ class ScoreFolder:
         return scores
 
     def _load(self, path: Path) -> np.ndarray:
-        """Return the array of a file. Pickled objects are never loaded."""
         message = f"{path}: expected NumPy scores, found a broken file; write it again"
         # Opened here, because NumPy leaves the file open if an array in it is broken.
         with one_line_errors(lambda _: message, only=READ_ERRORS), path.open("rb") as file:

@@ -151,6 +151,5 @@ def _report(segmenter: Segmenter, timings: Sequence[Timing]) -> dict[str, Any]:
 
 
 def _spread(values: Sequence[float]) -> dict[str, float]:
-    """Return the median and the quartiles of some values."""
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75)).tolist()
     return {"median": median, "low": low, "high": high}

@@ -182,7 +182,6 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
 
 
 def _layers(widths: tuple[int, ...]) -> list[nn.Module]:
-    """Return linear layers of the given widths, each followed by batch norm and ReLU."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [PointLinear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU(inplace=True)]

@@ -137,7 +137,6 @@ def _steps(start: Tensor, end: Tensor) -> Tensor:
 
 
 def _stages(c: RangeNetConfig) -> list[nn.Module]:
-    """Return the stages. The first block of each stage halves the width."""
     stages: list[nn.Module] = []
     channels = c.stem
     for width, blocks, stride in zip(c.widths, c.blocks, c.height_strides, strict=True):

@@ -148,7 +148,6 @@ def join(cuda: bool = False) -> Processes:
 
 
 def _node_count(size: int) -> int:
-    """Return the number of machines, given the number of processes."""
     local_size = os.environ.get("LOCAL_WORLD_SIZE")
     if local_size:
         return size // int(local_size)

@@ -59,7 +59,6 @@ def return_freed_memory() -> Iterator[None]:
 
 
 def _set_options(options: Mapping[int, int]) -> bool:
-    """Set options of glibc's allocator; return whether all were set."""
     if not sys.platform.startswith("linux"):
         return False
     try:

@@ -93,7 +93,6 @@ class Sensor:
         self._check("offset", _is_triple(self.offset), "x,y,z in metres, as 0,0,1.2")
 
     def _check(self, key: str, is_valid: bool, expected: str) -> None:
-        """Check the value of an attribute."""
         if not is_valid:
             found = shown(getattr(self, key))
             raise InputError(f"{key}: expected {expected}, found {found}; correct the value")
@@ -124,12 +123,10 @@ class Sensor:
 
 
 def _is_within(value: Any, low: float, high: float) -> bool:
-    """Return whether a value is unknown, or a number between two limits."""
     return value is None or (isinstance(value, int | float) and low <= value <= high)
 
 
 def _is_triple(values: Any) -> bool:
-    """Return whether values are unknown, or three finite numbers."""
     if values is None:
         return True
     return isinstance(values, tuple) and len(values) == 3 and all(map(math.isfinite, values))
@@ -182,7 +179,6 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
 
 
 def _read_sensor(text: str) -> Sensor:
-    """Return the sensor that a text names, or that a YAML file describes."""
     if text in KNOWN_SENSORS:
         return KNOWN_SENSORS[text]
 

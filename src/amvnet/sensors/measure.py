@@ -139,7 +139,6 @@ class Recording:
         return dataclasses.replace(measured, quantiles=self.usual.quantiles), True
 
     def _measure(self, cloud: Cloud) -> Estimate:
-        """Measure the sensor of one scan."""
         with errors_of(cloud.name):
             frame = find_frame(cloud.xyz[cloud.is_placed], self._sensor)
         return self._measure_in(frame, cloud)
@@ -169,7 +168,6 @@ class Recording:
         return False
 
     def _add(self, estimate: Estimate) -> None:
-        """Add the estimate of one of the first scans."""
         self._first.append(estimate)
         is_of_one_sensor = all(map(estimate.is_like, self._first))
         self.usual = median_of(self._first) if is_of_one_sensor else None
@@ -190,7 +188,6 @@ def median_of(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def _are_steady(frames: Sequence[Frame]) -> bool:
-    """Return whether the scans of a recording were recorded in one frame, at one height."""
     if len({(frame.unit, frame.axes) for frame in frames}) > 1:
         return False
     heights = [frame.height for frame in frames if frame.height is not None]

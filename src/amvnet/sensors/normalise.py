@@ -167,7 +167,6 @@ class Normaliser:
         return scan
 
     def _is_described(self, cloud: Cloud, estimate: Estimate) -> bool:
-        """Return whether an earlier line describes a recording; else, remember that one does."""
         for note, other in self._described:
             if note == cloud.note and estimate.is_near(other):
                 return True

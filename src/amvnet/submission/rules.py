@@ -155,7 +155,6 @@ RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuS
 
 
 def _count_points(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, int]:
-    """Return the number of points of each scan, by the name of its prediction."""
     points = {}
     for record in records:
         points[record.prediction] = dataset.count_points(record)

@@ -109,12 +109,10 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
 
 
 def _name(gru: bool, weighted: bool) -> str:
-    """Return the name of the folder of a variant."""
     return "rv" + ("-gru" if gru else "") + ("-weights" if weighted else "")
 
 
 def _ablated(recipe: Recipe, gru: bool, weighted: bool) -> Recipe:
-    """Return a recipe with or without the GRU and the class weights of the range view."""
     range_net = dataclasses.replace(recipe.model.range_net, gru=gru)
     rv = dataclasses.replace(recipe.training.rv, class_weights=weighted)
 

@@ -246,7 +246,6 @@ def _in_sector(scan: Scan, start: float, width: float) -> NDArray[np.bool_]:
 
 
 def _elevations(scan: Scan) -> NDArray[np.floating]:
-    """Return (N,) angles above the horizon, radians."""
     x, y, z = scan.points[:, :3].T
     elevation: NDArray[np.floating] = np.arctan2(z, np.hypot(x, y))
     return elevation
@@ -262,7 +261,6 @@ def _spread(values: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _keep(scan: Scan, mask: np.ndarray) -> Scan:
-    """Return a part of a scan, or the scan itself if no point would be left."""
     return scan.select(mask) if mask.any() else scan
 
 

@@ -207,7 +207,6 @@ class EpochLines(Callback):
 
 
 def _metrics(trainer: L.Trainer) -> dict[str, float]:
-    """Return the logged metrics of the epoch as plain numbers."""
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 

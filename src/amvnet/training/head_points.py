@@ -85,7 +85,6 @@ class HeadPoints:
         return len(self.labels)
 
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
-        """Return the points with some (U,) indices, in the order of the indices."""
         points = np.empty(len(index), dtype=self.dtype)
         for number, path in enumerate(self.paths):
             is_here = self._files[index] == number
@@ -203,7 +202,6 @@ class PointGatherer:
         return points
 
     def _scorer(self) -> Scorer:
-        """Return the function that scores a scan."""
         if self.plan.scores is not None:
             return self._read_scores
         model = self.plan.build(self.weights).to(self._device)
@@ -216,7 +214,6 @@ class PointGatherer:
     def _read_scores(
         self, record: ScanRecord, scan: Scan, batch: PointBatch
     ) -> tuple[Tensor, Tensor]:
-        """Return the scores of two other models for a scan, each (P, K)."""
         assert self.plan.scores is not None
         classes = self.weights.taxonomy.size
         f, g = self.plan.scores.read(Path(record.prediction), scan, classes)

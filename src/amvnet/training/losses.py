@@ -243,7 +243,6 @@ def lovasz_softmax(probabilities: Tensor, targets: Targets) -> Tensor:
 
 
 def _order(group: Tensor, errors: Tensor) -> Tensor:
-    """Return the (M,) indices that sort errors (M,) by group (M,), and the largest error first."""
     # Floats of at least 0 have the order of their bits, so one sort of whole numbers sorts by both.
     bits = errors.to(torch.float32).view(torch.int32).long()
     return (group * 2**32 - bits).argsort()

@@ -59,7 +59,6 @@ def train(plan: Plan) -> Path:
 
 
 def _draw_curves(plan: Plan) -> None:
-    """Draw the curves of all finished stages of the folder."""
     stages = {}
     for name in PART_OF:
         if is_finished(plan, name):

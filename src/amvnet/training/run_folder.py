@@ -170,7 +170,6 @@ def write_yaml(path: Path, tree: dict[str, Any]) -> None:
 
 
 def _entries(path: Path) -> dict[str, Any]:
-    """Return the entries of a YAML file of a run, or an empty dictionary if it is unreadable."""
     try:
         entries = parse_yaml(path.read_text(), f"{path}: expected the record of a run")
     except (OSError, ValueError):

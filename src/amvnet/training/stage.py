@@ -343,7 +343,6 @@ def _multiplies_bfloat16(device: str) -> bool:
 
 
 def _epochs_done(checkpoint: Path) -> int:
-    """Return the number of epochs before a checkpoint; raise InputError if the file is broken."""
     try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
         return int(state["epoch"]) + 1

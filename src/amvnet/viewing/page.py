@@ -314,7 +314,6 @@ def drawing() -> dict[str, Any]:
 
 
 def _table(evaluation: Evaluation) -> dict[str, Any] | None:
-    """Return the page's table: by method, a percentage for each class and for all classes."""
     if not evaluation.matrices:
         return None
 
@@ -337,7 +336,6 @@ def _table(evaluation: Evaluation) -> dict[str, Any] | None:
 
 
 def _percent(share: float | None) -> float | None:
-    """Return a share as a percentage with one decimal; None stays None."""
     return None if share is None else round(100 * share, 1)
 
 
@@ -362,7 +360,6 @@ def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
 
 
 def _to_bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Map values in [0, 1] to 0..255."""
     scaled: NDArray[np.uint8] = np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
     return scaled
 
@@ -403,7 +400,6 @@ def _ramp(name: str, start: float, end: float) -> list[list[int]]:
 
 
 def _source(name: str) -> str:
-    """Read one of the files in `page_assets`."""
     path = resources.files("amvnet.viewing") / "page_assets" / name
     return path.read_text(encoding="utf-8")
 

@@ -93,7 +93,6 @@ def _summary(weights: Weights) -> str:
 
 
 def _usage(weights: Weights, name: str) -> str:
-    """Return a few lines of Python that use the weights."""
     if weights.parts == ("point_head",):
         call = (
             f'labels = amvnet.fuse(points, f, g, head="{name}")'
@@ -112,7 +111,6 @@ def _usage(weights: Weights, name: str) -> str:
 
 
 def _sizes(weights: Weights) -> str:
-    """Return a list of the sizes of the views, and the threshold of uncertain points."""
     image = weights.model.range_view
     grid = weights.model.polar_view
     return (

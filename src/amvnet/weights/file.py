@@ -183,7 +183,6 @@ class Weights:
         return head.eval()
 
     def _load_part(self, part: str, module: torch.nn.Module) -> None:
-        """Load the parameters of one part into its module, as float32."""
         try:
             module.load_state_dict(self.part(part))
         except RuntimeError:
@@ -254,7 +253,6 @@ def load(name_or_path: str | Path) -> Weights:
 
 
 def _from_description(text: str) -> Weights:
-    """Return weights without parameters: what the description in a file says."""
     description = None
     if len(text) <= LONGEST_DESCRIPTION:
         with suppress(ValueError, RecursionError):
@@ -351,7 +349,6 @@ def list_weights() -> list[str]:
 
 
 def _find(name_or_path: str) -> Path:
-    """Return the path of a weights file; weights on the hub are downloaded if necessary."""
     if name_or_path.startswith(hub.PREFIX):
         return hub.fetch(name_or_path)
 

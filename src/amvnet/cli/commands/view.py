@@ -92,7 +92,6 @@ def view(
 
 
 def _title(inputs: list[str], weights: str | None) -> str:
-    """Return the title of a page: the first input, and what labelled it."""
     title = Path(inputs[0]).resolve().name
     if len(inputs) > 1:
         title += f" and {len(inputs) - 1} more"

@@ -100,7 +100,6 @@ def read_description(path: Path | str) -> Description:
 
 
 def _parse(path: Path, tree: Any) -> Description:
-    """Return what the YAML file says."""
     _check_keys("", tree, KEYS, required=("classes", "scans"))
     root = below(path.parent.absolute(), os.path.expanduser(_text(tree, "root", ".")))
 
@@ -176,7 +175,6 @@ def _ids(title: str, values: Any, least: int) -> list[int]:
 
 
 def _parse_labels(entry: Any) -> LabelPlace | None:
-    """Return where the labels are."""
     if entry is None:
         return None
     if isinstance(entry, str):
@@ -204,7 +202,6 @@ def _parse_labels(entry: Any) -> LabelPlace | None:
 
 
 def _parse_split(entry: Any) -> dict[str, tuple[str, ...]]:
-    """Return the names by split."""
     _check_keys("split", entry, SPLITS)
     splits = {}
     for split, values in entry.items():

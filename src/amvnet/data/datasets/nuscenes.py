@@ -319,7 +319,6 @@ class NuScenes(Dataset):
         return records
 
     def _record(self, row: Row, scene: str) -> ScanRecord:
-        """Return the scan of a row of sample_data."""
         token = checked_token(row["token"])
         labels_path = None
         if token in self._label_files:
@@ -347,7 +346,6 @@ class NuScenes(Dataset):
 
 
 def _is_scan(row: Row) -> bool:
-    """Return whether a row of sample_data is a key frame of the LiDAR."""
     return bool(row["is_key_frame"]) and str(row["filename"]).startswith(f"samples/{CHANNEL}/")
 
 

@@ -56,7 +56,6 @@ def is_dataset(spec: str) -> bool:
 
 
 def _open(spec: str) -> Dataset:
-    """Open a dataset with its own classes."""
     kind, _, rest = spec.partition(":")
     if kind in SIMULATED:
         from amvnet.data.datasets.simulated import SimulatedStreets
@@ -84,7 +83,6 @@ def _open(spec: str) -> Dataset:
 
 
 def _is_own(spec: str) -> bool:
-    """Return whether a text names the YAML file of a user's own scans."""
     return spec.partition(":")[0] == OWN or is_description(spec)
 
 
@@ -106,7 +104,6 @@ def _split_version(text: str) -> tuple[Path, str | None]:
 
 
 def _readers_of(path: Path) -> list[Reader]:
-    """Return the readers whose layout a folder has."""
     return [reader for reader in READERS.values() if reader.matches(path)]
 
 

@@ -111,19 +111,16 @@ class SemanticKitti(Dataset):
 
     @property
     def _folder(self) -> Path:
-        """The folder of the sequences."""
         inner = self.root / "sequences"
         return inner if inner.is_dir() else self.root
 
     def _sequences_on_disk(self) -> tuple[str, ...]:
-        """Return the names of the sequences on disk, sorted."""
         names = []
         for path in self._folder.glob("*/velodyne"):
             names.append(path.parent.name)
         return tuple(sorted(names))
 
     def _records(self, sequence: str) -> list[ScanRecord]:
-        """Return the scans of one sequence, in order."""
         folder = self._folder / sequence
         labelled = {path.name for path in (folder / "labels").glob("*.label")}
 

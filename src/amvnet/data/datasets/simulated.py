@@ -192,7 +192,6 @@ def _name(number: int) -> str:
 
 @cache
 def _simulator() -> str:
-    """Return a digest of the simulator's code and tables."""
     digest = hashlib.sha256()
     for path in sorted(Path(inspect.getfile(drive_street)).parent.rglob("*")):
         if path.suffix in (".py", ".toml"):
@@ -201,7 +200,6 @@ def _simulator() -> str:
 
 
 def _write(folder: Path, scan: Scan) -> None:
-    """Write a labelled scan as arrays."""
     folder.mkdir()
     arrays = {"points": scan.points, "labels": scan.labels, "ring": scan.ring}
     for name, array in arrays.items():

@@ -166,7 +166,6 @@ class TrainingData:
         return [self._turn(number, place, epoch) for place in range(self.places[number])]
 
     def __len__(self) -> int:
-        """Return the number of places in an epoch."""
         return sum(self.places)
 
     def read(self, index: int, epoch: int = 0, labels: bool = True) -> Scan:

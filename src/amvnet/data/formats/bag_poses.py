@@ -91,7 +91,6 @@ class BagPoses:
         return _by_odometry(name, transforms, found["frame"], found["times"], report)
 
     def _topics(self) -> dict[str, str]:
-        """Return the types of the topics with poses, by name."""
         topics: dict[str, str] = self._call(pose_topics)["topics"]
         return topics
 
@@ -243,7 +242,6 @@ def read_transforms(path: Path, ending: str, scan_topic: str | None, topic: str)
 
 
 def _with_poses(connections: Iterable[Any]) -> list[Any]:
-    """Return the connections of a bag whose messages are poses."""
     return [connection for connection in connections if connection.msgtype in POSE_TYPES]
 
 

@@ -185,7 +185,6 @@ def types_of(is_ros1: bool) -> Any:
 
 
 def _with_scans(connections: Iterable[Any]) -> list[Any]:
-    """Return the connections of a bag whose messages are scans."""
     return [connection for connection in connections if connection.msgtype == CLOUD_TYPE]
 
 

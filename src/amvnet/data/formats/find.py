@@ -131,7 +131,6 @@ def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
 
 
 def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> list[NamedScan]:
-    """Return the scans of a file or a bag."""
     ending = ending_of(file)
     if ending not in (FOLDER, *BAGS):
         read = partial(read_file, file, ending, layout)
@@ -219,7 +218,6 @@ def _folders_below(top: Path) -> list[Path]:
 
 
 def _advice_to_find(path: Path) -> str:
-    """Return the advice for a folder without scans."""
     if any(path.glob("*.label")):
         return "it holds labels, give the folder of the points"
     for pattern in ("*/*", "*/*/*"):

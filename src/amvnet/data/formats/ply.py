@@ -108,7 +108,6 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
-    """Return the encoding of a file and its elements."""
     encoding = ""
     elements: list[Element] = []
 

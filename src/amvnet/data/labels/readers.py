@@ -78,7 +78,6 @@ def read_raw_labels(
 
 
 def _read_field(path: Path, field: str, layout: RowLayout) -> np.ndarray:
-    """Read a column of a file, or an array of an archive."""
     ending = ending_of(path)
     if ending.endswith(".bin"):
         return _read_raw_column(path, layout, field)
@@ -95,7 +94,6 @@ def _read_field(path: Path, field: str, layout: RowLayout) -> np.ndarray:
 
 
 def _read_usual(path: Path, count: int) -> np.ndarray:
-    """Read a label file in the format that its ending names."""
     ending = path.suffix.lower()
     if ending in TEXT:
         return _read_numbers(path)

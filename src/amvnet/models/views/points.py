@@ -81,7 +81,6 @@ class PointBatch:
         return self._map(Tensor.pin_memory)
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> PointBatch:
-        """Return the batch with a function applied to each of its tensors."""
         ring = None if self.ring is None else function(self.ring)
         row = None if self.row is None else function(self.row)
         points = function(self.points)
