@@ -55,7 +55,6 @@ def label(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentati
 
 
 def write(base: Path, scans: Sequence[InputScan], kind: str = "label") -> None:
-    """Write labels, scores and uncertain points of scans, as predict and fuse do."""
     output = OutputOptions(base / "out", kind, scores=True, uncertain=True, overwrite=True)
     check_output(scans, output)
     Pipeline(scans, label, output).run({})
@@ -67,7 +66,6 @@ def some_cloud() -> Cloud:
 
 
 def named(name: str) -> InputScan:
-    """Return a scan file with a name."""
     return FileScan(
         NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud),
         FileReader(None),
@@ -76,7 +74,6 @@ def named(name: str) -> InputScan:
 
 
 def set_token(root: Path, token: str) -> None:
-    """Replace the token of the first scan in the tables of nuScenes."""
     path = root / "v1.0-mini/sample_data.json"
     rows = json.loads(path.read_text())
     for row in rows:

@@ -31,12 +31,10 @@ ANYTHING = Signature("a file", b"")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return the content of each file below a folder."""
     return {name: (folder / name).read_bytes() for name in files(folder)}
 
 
 def saved(array: np.ndarray) -> bytes:
-    """Return the bytes of an array in a file of NumPy."""
     file = io.BytesIO()
     np.save(file, array)
     return file.getvalue()

@@ -27,8 +27,6 @@ Run = Callable[[str, Sequence[str]], None]
 
 
 def raising(error: BaseException) -> Run:
-    """Return a command that fails."""
-
     def run(command: str, arguments: Sequence[str]) -> None:
         raise error
 
@@ -181,7 +179,6 @@ WRITTEN = 3  # scans that are labelled before the signal arrives
 
 
 def predict(world: Path, out: Path, *options: str) -> list[str]:
-    """Return the words of the command that labels the scans, one at a time."""
     words = ["predict", world / "scans", "--weights", world / "w.safetensors", "--out", out]
     return [*map(str, words), "--at-once", "1", *options]
 

@@ -96,13 +96,11 @@ def lzf_bomb(path: Path) -> None:
 
 
 def slow_lzf(path: Path) -> None:
-    """Write seven million points, each of the shortest repetitions."""
     size = 7_000_000 * 3
     write_pcd(path, size // 12, 12, b"\0\0" + b"\x20\0" * (size // 3 - 1) + b"\1\0\0")
 
 
 def largest_lzf(path: Path) -> None:
-    """Write as many points as a scan may have."""
     size = 10_000_000 * 32
     repetitions, rest = divmod(size - 1, 264)
     write_pcd(path, 10_000_000, 32, b"\0\0" + b"\xe0\xff\0" * repetitions + b"\0\0" * rest)

@@ -96,7 +96,6 @@ def test_feather_without_its_package_names_the_extra(
 
 @pytest.fixture(scope="module")
 def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The bytes of files of one scan, by name."""
     folder = tmp_path_factory.mktemp("files")
     contents = {}
     for name, write in WRITERS.items():

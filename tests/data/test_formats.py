@@ -56,7 +56,6 @@ def read_scan(path: Path) -> Scan:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one scan in every format."""
     folder = tmp_path_factory.mktemp("formats")
     for name, write in WRITERS.items():
         write(folder / name, some_points())
@@ -127,7 +126,6 @@ def test_comments_of_a_header_may_hold_any_bytes(tmp_path: Path) -> None:
 
 
 def fill_coordinates(table: np.ndarray, points: np.ndarray) -> None:
-    """Set the columns x, y, z of a table."""
     for name, values in zip("xyz", points[:, :3].T, strict=True):
         table[name] = values
 

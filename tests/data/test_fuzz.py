@@ -82,7 +82,6 @@ def change(content: bytes, changes: list[Change], share: float) -> bytes:
 
 @pytest.fixture(scope="module")
 def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The bytes of an intact file of every format."""
     folder = tmp_path_factory.mktemp("intact")
     for name, write in WRITERS.items():
         write(folder / name, some_points())

@@ -39,7 +39,6 @@ def describe(folder: Path, **changes: Any) -> Path:
 
 
 def only_scan(folder: Path, **changes: Any) -> np.ndarray | None:
-    """Return the labels of the only scan of a dataset."""
     data = open_dataset(f"files:{describe(folder, **changes)}")
     (record,) = data.records(data.sequences("all"))
     scan = data.read(record)
@@ -164,7 +163,6 @@ def sites(folder: Path, split: dict[str, Any] | None = None, labelled: str = "ab
 
 
 def sequences_of(data: OwnScans) -> tuple[set[str], set[str]]:
-    """Return the sequences that are trained on, and those that are validated with."""
     scans = to_train(data)
     return {record.sequence for record in scans.train}, {record.sequence for record in scans.val}
 

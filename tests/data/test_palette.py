@@ -18,7 +18,6 @@ TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 
 
 
 def to_lab(color: tuple[int, int, int]) -> np.ndarray:
-    """Return the (3,) CIELAB values of an RGB colour in 0..255."""
     encoded = np.array(color) / 255
     linear = np.where(encoded > 0.04045, ((encoded + 0.055) / 1.055) ** 2.4, encoded / 12.92)
     ratio = TO_XYZ @ linear / TO_XYZ.sum(axis=1)

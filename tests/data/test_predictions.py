@@ -31,11 +31,9 @@ class Predictions:
 
     @property
     def paths(self) -> list[Path]:
-        """The files of the predictions, sorted."""
         return sorted([*self.folder.rglob("*.label"), *self.folder.rglob("*.bin")])
 
     def score(self) -> float:
-        """Return the mIoU that `amvnet evaluate` reports."""
         report = self.folder.parent / "report.json"
         arguments = (self.spec, "--predictions", self.folder, "--json", report, "--overwrite")
         assert run_cli("evaluate", *arguments) == (0, "")

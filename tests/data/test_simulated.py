@@ -44,7 +44,6 @@ def simulated_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def streets(folder: Path) -> list[str]:
-    """Return the names of the streets in a cache, and of its unfinished folders."""
     return sorted(path.name for path in folder.glob("streets-*/*"))
 
 

@@ -34,7 +34,6 @@ QUICK = (SCANS.commands[0], SENSOR.commands[0])
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the files that the pages speak of."""
     folder = tmp_path_factory.mktemp("docs")
     points, _ = place(LASERS["vlp16"], 0.9)
     points.tofile(folder / "scan.bin")

@@ -22,7 +22,6 @@ WEIGHTS = "w.safetensors"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with a dataset and weights."""
     monkeypatch.chdir(tmp_path)
     make_streets(tmp_path / "dataset")
     save(fresh_weights(), WEIGHTS)
@@ -30,7 +29,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def changes(folder: Path) -> Changes:
-    """Return what lets the page use the data and the weights of the test."""
     return Changes(texts={"/data/kitti": str(folder), "sim-hdl64e": WEIGHTS})
 
 

@@ -287,7 +287,6 @@ def test_the_merge_of_a_gpu_is_that_of_a_cpu(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def check_bfloat16(weights: str | Weights, scan: Scan) -> None:
-    """Check that bfloat16 gives the labels of float32 on nearly all points of a scan."""
     exact = amvnet.load(weights)(scan)
     lower = amvnet.load(weights, precision="bfloat16")(scan)
     for name in ("scores", "rv", "bev"):
@@ -578,7 +577,6 @@ STAND_INS = {
 def test_the_commands_of_the_page_run(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Run them on a CPU."""
     monkeypatch.chdir(world)
     stand_ins = {**STAND_INS, "predictions": str(tmp_path)}
     predict, evaluate, *_ = DocsPage("docs/gpu.md").commands

@@ -298,7 +298,6 @@ def batch_of(*seeds: int) -> PointBatch:
 
 
 def check_scores(engine: TorchEngine, batch: PointBatch) -> None:
-    """Check that an engine scores a batch as torch on a CPU does."""
     expected = TorchEngine(WEIGHTS).score(batch)
     torch.testing.assert_close(engine.score(batch).merged, expected.merged)
 

@@ -34,7 +34,6 @@ WEIGHTS = shallow_weights()
 
 @pytest.fixture(scope="module", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory, graphs_converted_once: None) -> Iterator[Path]:
-    """Use one cache in all tests."""
     pytest.importorskip("onnxruntime")
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:

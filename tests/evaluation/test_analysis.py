@@ -72,7 +72,6 @@ def with_tau(weights: Weights, tau: float) -> Weights:
 
 
 def analyze_08(dataset: Dataset, weights: Weights) -> Analysis:
-    """Analyze the validation sequence."""
     return analyze(dataset, dataset.records(["08"]), amvnet.load(weights))
 
 

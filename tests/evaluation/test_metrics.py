@@ -22,7 +22,6 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 
 
 def golden_report(name: str, predictions: str) -> dict[str, Any]:
-    """Return this package's report of the golden scans and predictions of a benchmark."""
     dataset = open_dataset(f"{name}:{GOLDEN / name}")
     evaluation = Evaluation(dataset.taxonomy)
     for record in dataset.records(dataset.sequences("val")):
@@ -35,7 +34,6 @@ def golden_report(name: str, predictions: str) -> dict[str, Any]:
 
 
 def official_figures(name: str) -> dict[str, Any]:
-    """Return what the benchmark's official tool printed for the same scans and predictions."""
     return dict(json.loads((GOLDEN / name / "expected.json").read_text()))
 
 
@@ -81,8 +79,6 @@ def test_nuscenes_equals_the_official_tool() -> None:
 
 @dataclass
 class Example:
-    """A random scan of N points, its labels and a prediction."""
-
     points: np.ndarray
     truth: np.ndarray
     prediction: np.ndarray

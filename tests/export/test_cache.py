@@ -76,7 +76,6 @@ def cached(weights: Weights = WEIGHTS, int8: str | None = None) -> tuple[dict[st
 
 
 def filled(weights: Weights = WEIGHTS) -> Path:
-    """Return the folder of the cache after an export."""
     folder = cached_networks(weights).folder
     assert folder is not None
     return folder

@@ -38,8 +38,6 @@ QUANTISED = ("range_net", "polar_map")
 
 @dataclass(frozen=True)
 class Folders:
-    """The same graphs before and after they are quantised."""
-
     float32: Path
     int8: Path
 
@@ -95,12 +93,10 @@ def read_points(path: Path) -> np.ndarray:
 
 
 def nodes_by_output(model: Any) -> dict[str, Any]:
-    """Return the nodes of a graph by the name of their first output."""
     return {node.output[0]: node for node in model.graph.node}
 
 
 def kernels(model: Any) -> dict[str, Kernel]:
-    """Return each convolution's kernel by its name."""
     from onnx import numpy_helper
 
     stored = {value.name: numpy_helper.to_array(value) for value in model.graph.initializer}

@@ -167,7 +167,6 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def change(folder: Path, *keys: str, to: object) -> None:
-    """Change the value under some keys of a description, from the outermost key to the inmost."""
     description = read_description(folder)
     parent = description
     for key in keys[:-1]:

@@ -42,14 +42,12 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def labels(fleet: Path) -> dict[str, bytes]:
-    """The label files by `predict`, by their names."""
     paths = (fleet / "labels").rglob("*.label")
     return {path.relative_to(fleet / "labels").as_posix(): path.read_bytes() for path in paths}
 
 
 @pytest.fixture(scope="session")
 def bucket(fleet: Path) -> Iterator[object]:
-    """A bucket of an S3 server with the scans."""
     from fixtures.s3_server import s3_server
 
     with s3_server() as bucket:

@@ -28,7 +28,6 @@ NOWHERE = "/an/output/folder/elsewhere"
 
 
 def scans_of(inputs: Sequence[str], out: str = NOWHERE) -> list[tuple[str, str, str]]:
-    """Return the name, the drive and the URL of each scan."""
     rows = [row for table in list_scans(inputs, Place.of(out)) for row in table.to_pylist()]
     return [(row["name"], row["drive"], row["path"]) for row in rows]
 

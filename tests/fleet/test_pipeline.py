@@ -61,13 +61,11 @@ def ray_here(bucket: Bucket) -> Iterator[None]:
 
 
 def command(fleet: Path, out: str, *options: str, inputs: str = "s3://fleet/scans") -> list[str]:
-    """Return the words that label the scans of the bucket."""
     weights = f"{fleet}/w.safetensors"
     return ["fleet", inputs, "--weights", weights, "--out", out, "--workers", "2", *options]
 
 
 def table(bucket: Bucket, out: str) -> pa.Table:
-    """Return the table of results in the bucket."""
     parts = [key for key in bucket.keys(out) if "part-" in key]
     return pa.concat_tables(
         pa.parquet.read_table(BytesIO(bucket[f"{out}/{part}"])) for part in sorted(parts)
@@ -311,7 +309,6 @@ def scans_of(drive: str, *names: str) -> pa.Table:
 
 
 def run_in(fleet: Path, folder: Path, **options: bool) -> FleetRun:
-    """Return a run of one worker on one core."""
     request = LabellingRequest(load(fleet / "w.safetensors"), **options)  # type: ignore[arg-type]
     results = Results(Place.of(str(folder)), request)
     return FleetRun(request, results, Cluster(workers=1), {"num_cpus": 1})

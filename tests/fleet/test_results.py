@@ -44,7 +44,6 @@ def rows(names: Sequence[str], error: str | None = None) -> pa.Table:
 
 
 def touch(out: Place, names: Sequence[str]) -> None:
-    """Write label files."""
     for name in names:
         (out / f"{name}.label").write(b"label")
 
@@ -60,7 +59,6 @@ def read(out: Place) -> list[tuple[str, str | None]]:
 
 @pytest.fixture(params=["local", "s3"])
 def out(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
-    """An output folder that does not exist."""
     if request.param == "local":
         return Place.of(str(tmp_path / "out"))
     request.getfixturevalue("bucket")

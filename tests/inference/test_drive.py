@@ -31,7 +31,6 @@ POSES = drive_poses()
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a drive in SemanticKITTI's layout, weights, and the labels of the drive."""
     root = tmp_path_factory.mktemp("world")
     write_drive(root / "data")
     save(fresh_weights(), root / "w.safetensors")

@@ -56,7 +56,6 @@ def run_fuse(
 
 
 def read_labels(folder: Path) -> np.ndarray:
-    """Read the raw ids of all label files below a folder, in the order of their paths."""
     paths = sorted(folder.rglob("*.label"))
     labels = [np.fromfile(path, np.uint32) for path in paths]
     assert labels
@@ -64,7 +63,6 @@ def read_labels(folder: Path) -> np.ndarray:
 
 
 def read_probabilities(world: Path, key: str, scan: str = SCAN) -> np.ndarray:
-    """Read the (N, K) probabilities of one network."""
     with np.load(world / "predictions" / f"{scan}.npz") as file:
         return file[key]
 

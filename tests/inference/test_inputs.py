@@ -48,7 +48,6 @@ def weights_for(sensor: str = "hdl64e") -> Weights:
 
 
 def write(folder: Path, name: str, sensor: str, height: float, seed: int = 0) -> Path:
-    """Write a scan of a sensor to a file."""
     folder.mkdir(exist_ok=True)
     points, _ = place(LASERS[sensor], height, seed=seed)
     path = folder / f"{name}.npy"

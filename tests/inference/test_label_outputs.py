@@ -35,8 +35,6 @@ WITH_POINTS = ("ply", "pcd", "las", "laz")  # kinds of files with coordinates
 
 @dataclass(frozen=True)
 class LabelFile:
-    """The columns of a file as another library reads them."""
-
     raw: np.ndarray
     xyz: np.ndarray | None = None
     colors: np.ndarray | None = None
@@ -254,7 +252,6 @@ def test_a_missing_package_is_named_before_the_work(
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with single scans of three formats, two of them in `scans`."""
     root = tmp_path_factory.mktemp("recorded")
     points = some_points(400)
     (root / "scans").mkdir()
@@ -268,12 +265,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def predict(world: Path, out: Path, *words: object) -> tuple[int, str]:
-    """Run `amvnet predict`; return the exit code and the text of stderr."""
     return run_cli("predict", *words, "--weights", world / "w.safetensors", "--out", out)
 
 
 def failure(world: Path, out: Path, *words: object) -> str:
-    """Check that `amvnet predict` ends in an error of one line, and return it."""
     code, message = predict(world, out, *words)
     assert code == 2
     assert message.count("\n") == 1

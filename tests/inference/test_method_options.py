@@ -23,7 +23,6 @@ WEIGHTS = replace(FRESH, model=replace(FRESH.model, assertion=AssertionConfig(th
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of one sequence, and weights."""
     root = make_streets(tmp_path_factory.mktemp("world"), sequences=("08",))
     save(WEIGHTS, root / "w.safetensors")
     return root

@@ -53,7 +53,6 @@ WEIGHTS = "w.safetensors"
 
 
 def predict(world: Path, out: Path, options: str = "") -> str:
-    """Return the command that segments the lone scans."""
     return f"predict {world}/scans --weights {world}/{WEIGHTS} --out {out} {options}"
 
 
@@ -74,14 +73,12 @@ print(code, unneeded & set(sys.modules))
 
 @pytest.fixture(scope="module")
 def whole(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that an undisturbed run writes."""
     out = tmp_path_factory.mktemp("whole")
     succeed(predict(world, out))
     return out
 
 
 def check_same(a: Path, b: Path) -> None:
-    """Check that two folders hold the same files."""
     assert files(a) == files(b)
     for name in files(a):
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
@@ -131,7 +128,6 @@ def test_only_broken_scans_are_one_line(world: Path, tmp_path: Path) -> None:
 
 
 def no_segmentation(scan: Scan) -> Segmentation:
-    """Return labels and scores of 0."""
     n = len(scan)
     return Segmentation(np.zeros(n, np.uint8), np.zeros(n, bool), np.zeros((n, 1), np.float32))
 
@@ -281,12 +277,10 @@ def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_p
 
 
 def times_of(folder: Path) -> dict[str, int]:
-    """Return when each label file was written."""
     return {path.name: path.stat().st_mtime_ns for path in folder.glob("0*.label")}
 
 
 def said_by(command: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Run a command, and return what it says at the end."""
     capsys.readouterr()
     succeed(command)
     return "\n".join(capsys.readouterr().out.splitlines()[-2:])

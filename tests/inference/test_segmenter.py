@@ -50,7 +50,6 @@ def labels_by(method: MethodName, points: np.ndarray = POINTS) -> np.ndarray:
 
 
 def both_networks(result: Segmentation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the probabilities (N, K) of the range view and of the bird's-eye view."""
     assert result.rv is not None
     assert result.bev is not None
     return result.rv, result.bev
@@ -430,7 +429,6 @@ def test_the_rows_of_a_scan_take_precedence_over_its_elevations_and_rings() -> N
 
 
 def segmenter_by_ring(weights: Weights) -> Segmenter:
-    """Return a segmenter whose rows are the rings of the scans."""
     view = replace(weights.model.range_view, rows="ring")
     return amvnet.load(replace(weights, model=replace(weights.model, range_view=view)))
 

@@ -22,7 +22,6 @@ POINTS = street(5, 400)[0]
 
 
 def with_usual(share: Any) -> Weights:
-    """Return weights whose validation had a share of uncertain points."""
     weights = fresh_weights()
     return replace(weights, metrics={**weights.metrics, "point_head": {UNCERTAIN: share}})
 
@@ -128,7 +127,6 @@ def test_points_that_a_map_of_classes_ignores_count_as_others_do() -> None:
 
 
 def said(world: Path, out: Path, weights: Weights, capsys: Any, *options: str) -> str:
-    """Segment a sequence of the dataset; return what is printed."""
     path = save(weights, out / "w.safetensors")
     words = ("predict", world / "data", "--weights", path, "--out", out / "labels", *options)
     assert run_cli(*words, "--sequences", "00") == (0, "")

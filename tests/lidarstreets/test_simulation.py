@@ -41,7 +41,6 @@ def exact_device(sensor: LidarModel) -> LidarModel:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file below a folder."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest() for path in files}
 
@@ -58,7 +57,6 @@ SEEDS = (5, 0, 1, 2, 3)
 
 @pytest.fixture(scope="module", params=first_of((1, len(SEEDS))), ids="{} streets".format)
 def scans(request: pytest.FixtureRequest) -> list[SimulatedScan]:
-    """Two scans of each of some streets."""
     pytest.importorskip("embreex")
     scans: list[SimulatedScan] = []
     for seed in SEEDS[: request.param]:

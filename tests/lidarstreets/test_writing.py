@@ -32,7 +32,6 @@ SETTINGS: dict[str, Any] = {"sensor": "hdl32e", "sequences": 2, "scans": 3, "see
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file below a folder."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest() for path in files}
 
@@ -70,7 +69,6 @@ def real_nuscenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def table(folder: Path, name: str) -> list[dict[str, Any]]:
-    """Return the rows of one of nuScenes' tables."""
     rows: list[dict[str, Any]] = json.loads((folder / f"v1.0-trainval/{name}.json").read_text())
     return rows
 

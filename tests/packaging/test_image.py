@@ -18,7 +18,6 @@ def normalize(name: str) -> str:
 
 
 def locked() -> dict[str, str]:
-    """Return the versions that the image installs, by name."""
     versions = {}
     for path in ("docker/requirements.txt", "constraints.txt"):
         for line in (ROOT / path).read_text().splitlines():

@@ -25,7 +25,6 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 def labelled(
     labels: np.ndarray, xyz: np.ndarray | None = None, uncertain: np.ndarray | None = None
 ) -> LabelledPoints:
-    """Return points with these labels, in black."""
     count = len(labels)
     xyz = np.zeros((count, 3)) if xyz is None else xyz
     return LabelledPoints(xyz, labels, np.zeros((count, 3), np.uint8), uncertain)

@@ -16,7 +16,6 @@ def ignore(error: Exception) -> None:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds."""
     end = time.monotonic() + PATIENCE  # comes only if the condition never holds
     while not condition():
         assert time.monotonic() < end

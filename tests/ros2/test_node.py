@@ -97,7 +97,6 @@ def send(node: Any, message: Any) -> None:
 
 
 def report(node: Any) -> Any:
-    """Let the node report, and return the DiagnosticStatus."""
     (timer,) = node.timers
     timer()
     (status,) = node.publishers["/diagnostics"].messages[-1].status
@@ -310,7 +309,6 @@ def drive() -> Drive:
 
 
 def labels_of(node: Any) -> list[np.ndarray]:
-    """Return the labels of all clouds that the node published."""
     labels = []
     for message in node.publishers["~/cloud"].messages:
         labels.append(np.frombuffer(over_the_wire(message).data, RECORD)["label"])

@@ -33,7 +33,6 @@ def setup_arguments(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def text(tag: str) -> str:
-    """Return the text of the only element of the manifest with a tag."""
     (element,) = MANIFEST.findall(tag)
     return element.text or ""
 

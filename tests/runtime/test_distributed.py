@@ -139,7 +139,6 @@ def free_port() -> int:
 
 
 def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
-    """Return the command that trains a stage in a new folder."""
     out.mkdir()
     recipe = write_recipe(out / "tiny.yaml", model=MODEL, training=TRAINING)
     arguments = ["train", recipe, "--data", world / "data", "--out", out / "run", "--stage", stage]

@@ -37,7 +37,6 @@ def tilted(xyz: np.ndarray, pitch: float, roll: float) -> np.ndarray:
 
 
 def normalise(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]:
-    """Return the normalised scan, and what was said."""
     lines: list[str] = []
     intensity = np.linspace(0, 0.6, len(xyz))
     scan = Normaliser(WEIGHTS.expects, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")

@@ -63,7 +63,6 @@ def weights_with(**how: bool) -> Weights:
 def normalise(
     clouds: list[Cloud], sensor: Sensor | None = None, **how: bool
 ) -> tuple[list[Scan], list[str]]:
-    """Return the normalised scans of one source, and what was said."""
     lines: list[str] = []
     normaliser = Normaliser(weights_with(**how).expects, sensor, lines.append)
     return [normaliser(cloud, "a") for cloud in clouds], lines

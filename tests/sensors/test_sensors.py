@@ -466,7 +466,6 @@ def test_sensors_are_described_as_they_are_simulated() -> None:
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make weights for two sensors, and scans of another one."""
     root = tmp_path_factory.mktemp("sensors")
     save(trained_for(WEIGHTS, "hdl64e"), root / "w.safetensors")
     save(trained_for(NUSCENES_WEIGHTS, "hdl32e"), root / "ring.safetensors")

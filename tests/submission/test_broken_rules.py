@@ -29,8 +29,6 @@ class Fault:
 
 
 def changed(change: Callable[[bytes], bytes]) -> Callable[[Case], Entries]:
-    """The good files with the first prediction changed."""
-
     def entries(case: Case) -> Entries:
         return {**case.good, case.first: change(case.good[case.first])}
 
@@ -46,8 +44,6 @@ def nothing(case: Case) -> Entries:
 
 
 def as_type(dtype: str) -> Callable[[Case], Entries]:
-    """The classes of the first prediction in another number type."""
-
     def convert(data: bytes) -> bytes:
         classes = np.frombuffer(data, "<u4") & 0xFFFF
         return classes.astype(dtype).tobytes()
@@ -60,7 +56,6 @@ def uint8_as_uint32(data: bytes) -> bytes:
 
 
 def filled(*raw_ids: int) -> Callable[[Case], Entries]:
-    """The first prediction filled with these ids."""
     return changed(lambda data: np.resize(np.array(raw_ids, "<u4"), len(data) // 4).tobytes())
 
 

@@ -39,7 +39,6 @@ def submit(spec: str, *options: object) -> tuple[int, str]:
 
 
 def without_sources(entries: Entries) -> Entries:
-    """Return the files of an archive, without submission.json."""
     rest = {}
     for name, content in entries.items():
         if not name.endswith(("/", ".json")):

@@ -28,7 +28,6 @@ TEACHER = "teacher/00"
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a drive without labels, weights, and a run that adapts them."""
     root = tmp_path_factory.mktemp("world")
     write_drive(root / "data", scans=SCANS)
     shutil.rmtree(root / "data/sequences/00/labels")

@@ -34,12 +34,10 @@ def distances(scan: Scan) -> np.ndarray:
 
 
 def azimuths(scan: Scan) -> np.ndarray:
-    """Return (N,) azimuths in radians."""
     return np.array([math.atan2(y, x) for x, y, _, _ in scan.points.tolist()])
 
 
 def elevations(scan: Scan) -> np.ndarray:
-    """Return (N,) angles above the horizon in radians."""
     return np.array([math.atan2(z, math.hypot(x, y)) for x, y, z, _ in scan.points.tolist()])
 
 

@@ -26,7 +26,6 @@ from fixtures.tiny import make_streets, write_recipe
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make streets, a recipe of one epoch, and a run of both networks."""
     root = tmp_path_factory.mktemp("world")
     make_streets(root / "data")
     epochs = {"rv": {"epochs": 1}, "bev": {"epochs": 1}}

@@ -34,13 +34,11 @@ def loss_of(
     weights: Tensor | None = None,
     region: float = 1.0,
 ) -> Tensor:
-    """Return the loss of a single scan."""
     scored = Scored(logits, labels, torch.zeros(len(labels), dtype=torch.long), scans=1)
     return network_loss(scored, weights, region, region_loss)
 
 
 def region_of(region_loss: RegionLoss, probabilities: Tensor, target: Tensor) -> Tensor:
-    """Return the region loss of a single scan."""
     scan = torch.zeros_like(target)
     return region_loss(probabilities, Targets.of(target, scan, (1, probabilities.shape[1])))
 

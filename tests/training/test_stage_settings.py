@@ -29,7 +29,6 @@ from fixtures.tiny import fresh_weights, make_streets, write_recipe
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make five scans to train on, and a recipe."""
     root = tmp_path_factory.mktemp("world")
     make_streets(root / "data", ("00", "01", "02", "03", "04"), scans=1)
     write_recipe(root / "recipe.yaml")

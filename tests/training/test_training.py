@@ -66,7 +66,6 @@ STAGES = pytest.mark.parametrize("stage", PART_OF)
 
 
 def train(world: Path, out: Path, *options: object) -> Weights:
-    """Run a training that must succeed, and return its weights."""
     arguments = train_arguments(world, out)
     if "--data" in options:
         del arguments[2:4]
@@ -102,7 +101,6 @@ def column(run: Path, stage: str, name: str) -> list[float]:
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make streets and a recipe."""
     root = tmp_path_factory.mktemp("world")
     make_streets(root / "data")
     write_recipe(root / "recipe.yaml")
@@ -111,7 +109,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(world: Path) -> Path:
-    """Train all stages without interruption."""
     train(world, world / "run")
     return world / "run"
 

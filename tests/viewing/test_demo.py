@@ -20,7 +20,6 @@ __all__ = ["browser"]
 
 
 def run_demo(root: Path, weights: Weights, *options: object) -> tuple[int, str]:
-    """Run the demo on one street with small weights."""
     save(weights, root / "w.safetensors")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "SEQUENCES", 1)

@@ -49,7 +49,6 @@ HOSTILE = "</script><img src=x onerror=\"document.title='owned'\">&amp;'\"@@ABOU
 
 @pytest.fixture(scope="module")
 def path(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a page of the six scans of the dataset, with weights."""
     html = tmp_path_factory.mktemp("page") / "p.html"
     options = ("--weights", world / "w.safetensors", "--scans", 9, "--html", html)
     assert run_cli("view", world / "data", *options) == (0, "")
@@ -272,7 +271,6 @@ def test_nothing_is_fetched(path: Path) -> None:
 
 
 def policy_of(page: Page) -> dict[str, str]:
-    """Return the directives of a page's content security policy."""
     for tag, attributes in page.elements:
         if tag == "meta" and attributes.get("http-equiv"):
             return dict(re.findall(r"([a-z-]+) ([^;]+)", attributes["content"] or ""))

@@ -124,7 +124,6 @@ def with_ring(points: np.ndarray, laser: np.ndarray, scale: float = 255) -> np.n
 
 
 def by_laser(points: np.ndarray, laser: np.ndarray) -> np.ndarray:
-    """Return points in the order of KITTI's files."""
     turn = np.mod(np.arctan2(points[:, 1], points[:, 0]), 2 * np.pi)
     return points[np.lexsort([turn, -laser])]
 

@@ -106,14 +106,12 @@ def test_parameters_that_do_not_fit_their_sizes_are_refused(weights: Weights) ->
 
 
 def read_description(content: bytes) -> dict[str, Any]:
-    """Return the description in the bytes of a weights file."""
     size = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + size])
     return json.loads(header["__metadata__"]["amvnet"])
 
 
 def save_described(path: Path, description: Any) -> None:
-    """Write a safetensors file with any description."""
     save_file({"range_net.a": torch.zeros(2)}, path, metadata={"amvnet": json.dumps(description)})
 
 

@@ -161,7 +161,6 @@ def description(weights: Weights) -> dict[str, Any]:
 
 
 def write_weights(path: Path, tensors: Mapping[str, torch.Tensor], text: str) -> Path:
-    """Write a weights file with any description."""
     save_file(dict(tensors), path, metadata={"amvnet": text})
     return path
 
@@ -174,8 +173,6 @@ def good(weights: Weights, description: Any, tmp_path_factory: pytest.TempPathFa
 
 @dataclass(frozen=True)
 class Content:
-    """The parameters and the description of a weights file."""
-
     tensors: Mapping[str, torch.Tensor]
     text: str
 

@@ -116,8 +116,6 @@ def test_an_overgrown_fence_has_leaves_and_those_within_it_are_fence() -> None:
 
 
 class NoGround:
-    """The ground of a scene without any."""
-
     def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.zeros(len(x), dtype=np.uint16)
 
@@ -167,7 +165,6 @@ def test_a_clipped_hedge_is_fuzzy_by_centimetres() -> None:
 
 @pytest.fixture(scope="module")
 def scans() -> list[SimulatedScan]:
-    """One scan of each of eight streets."""
     pytest.importorskip("embreex")
     scans: list[SimulatedScan] = []
     for seed in range(8):

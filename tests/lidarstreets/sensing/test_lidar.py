@@ -42,8 +42,6 @@ Points = tuple[np.ndarray, np.ndarray]
 
 
 class PlainRoad:
-    """Ground that is road everywhere."""
-
     def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.full(len(x), Label.ROAD, dtype=np.uint16)
 
@@ -58,7 +56,6 @@ def scan_mesh(
     speed: float = 0.0,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points, labels and rings of one scan of a mesh."""
     if pose is None:
         pose = np.eye(4)
     rng = np.random.default_rng(seed)

@@ -55,7 +55,6 @@ def test_vehicles_of_one_lane_do_not_overlap(seed: int) -> None:
 
 @cache
 def draw_site(seed: int) -> tuple[Site, np.ndarray]:
-    """Return a street and the poses (x, y, yaw) of four scans in it."""
     rng = np.random.default_rng(seed)
     drive = Drive()
     way = (drive.margin, drive.margin + 4 * drive.spacing)
