@@ -48,10 +48,9 @@ def reason_of(error: BaseException) -> str:
 
 
 class SomeBroken(Exception):
-    """Raised at the end if some inputs could not be used. All others have been processed.
+    """Raised at the end if some inputs could not be used, with a line for each of these `faults`.
 
-    Attributes:
-        faults: one line for each broken input.
+    All others have been processed.
     """
 
     def __init__(self, line: str, faults: list[str]) -> None:

@@ -81,8 +81,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """Yield a new folder, which is removed at the end, even if the process exits at once.
 
-    Args:
-        parent: the folder in which it is made. By default, it is the system's temporary folder.
+    It is made in the folder `parent`, by default the system's temporary folder.
     """
     if parent is None:
         folder = Path(tempfile.gettempdir()) / f"amvnet-{uuid.uuid4().hex}"

@@ -315,12 +315,7 @@ def distances(points: np.ndarray) -> np.ndarray:
 def polar_features(
     view: PolarViewConfig, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sort finite points (P, 4) into the polar grid.
-
-    Returns:
-        The points' features (P, 9) float32, their pillars (P,), and their voxels (P,) within the
-        pillars.
-    """
+    """Return (P, 9) float32 features of finite points (P, 4), their pillars, and their voxels."""
     x, y, z = points[:, :3].astype(np.float64).T
     polar = np.stack([np.sqrt(x * x + y * y), np.arctan2(y, x), z], axis=1)
 
@@ -338,12 +333,7 @@ def polar_features(
 
 
 def pool(pillar: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (M,) occupied pillars in ascending order, and their (M, C) maximum features.
-
-    Args:
-        pillar: (P,) pillar of each point.
-        features: (P, C) features of the points.
-    """
+    """Return the (M,) occupied pillars, ascending, and their maxima (M, C) of features (P, C)."""
     order = np.argsort(pillar, kind="stable")
     occupied, starts = np.unique(pillar[order], return_index=True)
     return occupied, np.maximum.reduceat(features[order], starts, axis=0)
@@ -458,12 +448,7 @@ def read_graph(folder: Path, graph: Mapping[str, Any]) -> bytes:
 
 
 def open_session(path: Path, content: bytes, providers: Sequence[str]) -> Any:
-    """Open a graph in ONNX Runtime; raise InputError if it cannot be opened.
-
-    Args:
-        path: the path of the graph's file, for messages.
-        content: the content of the file.
-    """
+    """Open the content of a graph's file in ONNX Runtime; raise InputError if that fails."""
     try:
         import onnxruntime
     except ImportError:

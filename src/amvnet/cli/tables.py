@@ -82,11 +82,7 @@ def contents_table(report: Report) -> Table:
 
 
 def labelled_table(counts: Sequence[Sequence[int]], taxonomy: Taxonomy) -> Table:
-    """Return the table of the points of each class in the labels of some scans, most first.
-
-    Args:
-        counts: for each scan, the number of points of each train id, from 0.
-    """
+    """Return the table of the points of each class, most first, of the counts (K + 1,) of scans."""
     totals = Counter[str]()
     for of_scan in counts:
         totals.update(dict(zip(taxonomy.names, of_scan, strict=False)))

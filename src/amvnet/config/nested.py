@@ -66,11 +66,9 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def flat(tree: Any, name: str = "", depth: int = MAX_DEPTH) -> Iterator[tuple[str, Any]]:
-    """Yield the keys and values of nested dictionaries; dots join the keys of several levels.
+    """Yield keys and values of nested dictionaries to a depth; dots join keys of several levels.
 
-    Args:
-        name: the key of `tree` itself, if it is a part of a larger tree.
-        depth: number of levels to follow. A dictionary on a deeper level is yielded as a value.
+    `name` is the key of `tree` itself, if it is a part of a larger tree.
     """
     if not isinstance(tree, Mapping) or not depth:
         yield name, tree

@@ -44,12 +44,7 @@ def load_recipe(name_or_path: str) -> Recipe:
 
 
 def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]:
-    """Read a recipe, merged with its bases.
-
-    Args:
-        name_or_path: the name of a built-in recipe, or the path of a YAML file.
-        dependents: the recipes that build on this recipe, to detect a circle of bases.
-    """
+    """Read a recipe, merged with its bases; `dependents` build on it, to detect a circle."""
     if name_or_path in dependents:
         raise InputError(
             f"{name_or_path}: expected bases without a circle, "

@@ -19,12 +19,7 @@ BUILT_IN = ("coarse", "lidog")  # the maps in files of this package, by name
 
 @dataclass(frozen=True)
 class ClassMap:
-    """A map from the names of classes, of any taxonomy, to the classes of another taxonomy.
-
-    Attributes:
-        target: the classes of the result.
-        sources: for each name of a class, the train id in `target` that the class becomes.
-    """
+    """A map from the names of classes (`sources`) to train ids of another taxonomy (`target`)."""
 
     target: Taxonomy
     sources: Mapping[str, int]

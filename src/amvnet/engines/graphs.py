@@ -26,11 +26,7 @@ LARGEST_SHARE = 0.001  # the largest share of points that may change more
 
 
 class GraphCheck:
-    """A check that turns off the CUDA graphs of a model if one fails or gives other scores.
-
-    Attributes:
-        is_passed: False once a graph has failed.
-    """
+    """A check that turns off the CUDA graphs of a model if one fails or gives other scores."""
 
     def __init__(self) -> None:
         self.is_passed = True

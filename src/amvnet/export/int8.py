@@ -99,11 +99,7 @@ def quantise(
 
 
 class _Recorder(OnnxSegmenter):
-    """Segments scans, and records the inputs of the graphs to quantise.
-
-    Attributes:
-        recorded: for each graph, the input of each run, as an array by the name of the input.
-    """
+    """Segments scans, and records the inputs of the graphs to quantise, by graph and by run."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)

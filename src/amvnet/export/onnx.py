@@ -138,11 +138,7 @@ def _write_all(
     folder: Path,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Write the graphs of a method, with convolutions in int8 if there are scans.
-
-    Returns:
-        The description of the folder, for `amvnet.json`.
-    """
+    """Write the graphs of a method, in int8 if there are scans; return what `amvnet.json` says."""
     written: dict[str, dict[str, Any]] = {}
     with torch.no_grad():
         graphs = _graphs(weights, method)

@@ -85,12 +85,7 @@ class Journal:
 
 
 class EarlierRun(NamedTuple):
-    """What the journals of an earlier run say.
-
-    Attributes:
-        entries: the scans that are done, by their names.
-        settings: the settings of each journal.
-    """
+    """What the journals of an earlier run say: the scans that are done, by name, and settings."""
 
     entries: dict[str, Entry]
     settings: list[dict[str, Any]]

@@ -83,12 +83,7 @@ def predict(
 def segment_by(
     segmenter: Segmenter, classes: ClassMap | None = None, drives: Drives | None = None
 ) -> Segment:
-    """Return a function that segments scans.
-
-    Args:
-        classes: maps the labels to other classes; without it, they stay unchanged.
-        drives: the drives of the scans, if their scores are to be fused over time.
-    """
+    """Return a function that segments scans, with labels in other classes and fused over drives."""
     table = None if classes is None else classes.table(segmenter.taxonomy)
 
     def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
@@ -106,8 +101,7 @@ def report_certainty(
 ) -> None:
     """Report how sure the labels are, which recordings have doubtful labels, and what to try.
 
-    Args:
-        usual: the usual share of uncertain points, in [0, 1]; None if it is not known.
+    The usual share of uncertain points is in [0, 1]; None if it is not known.
     """
     points: Counter[str] = Counter()
     uncertain: Counter[str] = Counter()

@@ -91,12 +91,7 @@ def split_into_blocks(xyz: Tensor) -> Blocks:
 
 
 def _cut(index: Tensor, positions: Tensor, pieces: int) -> Tensor:
-    """Cut each part across an axis: (M, B) indices -> (M * pieces, B / pieces).
-
-    Args:
-        index: (M, B) indices of the points of each part.
-        positions: (M, B) positions of the points along the axis.
-    """
+    """Cut each part across an axis by positions on it: (M, B) -> (M * pieces, B / pieces)."""
     return index.gather(1, positions.argsort(dim=1)).view(len(index) * pieces, -1)
 
 

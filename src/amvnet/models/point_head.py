@@ -168,12 +168,7 @@ def head_features(
 
 
 def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
-    """Return the indices (U, n) of the nearest other points of some points of a scan.
-
-    Args:
-        points: (P, 4), all points of the scan.
-        index: (U,) indices of the points whose neighbours are wanted.
-    """
+    """Return indices (U, n) of the nearest others of the points `index` (U,) of a scan (P, 4)."""
     if points.is_cuda:
         return nearest_others_by_blocks(points[:, :3], index, n)
 

@@ -77,11 +77,9 @@ class PolarNet(nn.Module):
 
 
 class DropBlock(nn.Module):
-    """Drop squares of a map in training, and scale up the remaining cells (Ghiasi et al., 2018).
+    """Drop squares of `size` cells in training, and scale up the others (Ghiasi et al., 2018).
 
-    Args:
-        probability: probability that a cell is dropped.
-        size: side of the squares, cells.
+    `probability` is that of a cell to be dropped.
     """
 
     def __init__(self, probability: float, size: int) -> None:

@@ -20,12 +20,7 @@ SMALL_STEP = 0.1  # metres; `surface_steps` is linear for smaller steps
 
 
 class RangeNet(nn.Module):
-    """The network that takes range images (B, 6, H, W) and returns logits (B, K, H, W).
-
-    Args:
-        config: the sizes of the network.
-        classes: K, number of classes.
-    """
+    """The network that takes range images (B, 6, H, W) and returns logits (B, K, H, W)."""
 
     def __init__(self, config: RangeNetConfig, classes: int) -> None:
         super().__init__()

@@ -15,11 +15,9 @@ APART = 4.0  # least distance between cells of different kinds, cells
 
 
 def cluster(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """Return the (N,) int64 cluster of each point, numbered from 0.
+    """Return the (N,) int64 cluster, from 0, of each point at (N, 3) metres.
 
-    Args:
-        xyz: (N, 3) coordinates, metres.
-        kind: (N,) integers. Points of different kinds are never in one cluster.
+    Points of different kinds, (N,) integers, are never in one cluster.
     """
     if not len(xyz):
         return np.zeros(0, dtype=np.int64)

@@ -222,12 +222,7 @@ def _most_common(ids: NDArray[np.integer], group: NDArray[np.intp], count: int) 
 def write_clusters(
     clusters: np.ndarray, records: Sequence[ScanRecord], taxonomy: Taxonomy, path: Path
 ) -> None:
-    """Write clusters to a CSV file with their ranks in the first column.
-
-    Args:
-        clusters: (C,) rows of `ROW`, sorted.
-        path: the file, which appears whole or not at all.
-    """
+    """Write clusters, sorted rows of `ROW`, to a CSV file with their ranks in the first column."""
     names = ("", *taxonomy.classes)
     with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -120,12 +120,7 @@ def _slurm_tasks() -> int:
 
 @functools.cache
 def join(cuda: bool = False) -> Processes:
-    """Connect to the other processes of this job, if there are any.
-
-    Args:
-        cuda: whether the processes compute on CUDA devices. They then exchange gradients by NCCL
-            instead of gloo.
-    """
+    """Connect to the other processes of this job, if any; by NCCL with CUDA, else by gloo."""
     if started() == 1:
         return ALONE
 

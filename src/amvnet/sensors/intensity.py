@@ -192,11 +192,7 @@ class IntensityMap:
     trained: TrainedIntensity | None = None
 
     def __call__(self, intensity: np.ndarray | None, count: int) -> np.ndarray:
-        """Return the mapped intensities of a scan: (count,) in [0, 1]. NaN stays NaN.
-
-        Args:
-            intensity: (count,) intensities in the file, or None if it has none.
-        """
+        """Return the mapped intensities of a scan: (count,) in [0, 1]. NaN stays NaN."""
         with np.errstate(over="ignore", invalid="ignore"):
             if intensity is not None and self.scale is not None:
                 return as_fractions(intensity, self.scale)

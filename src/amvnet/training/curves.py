@@ -38,11 +38,7 @@ class Curves:
 
 
 def read_curves(folder: Path, taxonomy: Taxonomy) -> Curves:
-    """Read the curves of a stage from its TensorBoard files.
-
-    Args:
-        folder: the folder of the stage. If its files lack a metric, the curve is empty.
-    """
+    """Read the curves of a stage from its folder's TensorBoard files; they may lack metrics."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
@@ -65,11 +61,7 @@ def read_curves(folder: Path, taxonomy: Taxonomy) -> Curves:
 
 
 def draw_curves(stages: Mapping[str, Curves], path: Path) -> Path:
-    """Draw the curves of stages into a PNG file, and return its path.
-
-    Args:
-        stages: the curves by the name of the stage. Each stage gets a row of three diagrams.
-    """
+    """Draw the curves of stages, a row of three diagrams for each, into a PNG; return its path."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 

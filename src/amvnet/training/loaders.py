@@ -173,9 +173,7 @@ def make_loader(
 ) -> data.DataLoader[tuple[PointBatch, Tensor, Tensor]]:
     """Make a loader of this process's batches. The last batch of an epoch may be smaller.
 
-    Args:
-        workers: number of processes that read scans; 0 reads them in this process.
-        shuffle: whether an `EpochSampler` draws the scans of each epoch, as in training.
+    No `workers` read the scans in this process; `shuffle` lets an `EpochSampler` draw them.
     """
     sampler: data.Sampler[Any] | list[Key] = EpochSampler(len(scans), scans.seed, processes)
     if not shuffle:

@@ -33,9 +33,7 @@ NO_LICENCE = (
 def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
     """Return the card of a weights file, without the metadata of `front_matter`.
 
-    Args:
-        name: the name by which `amvnet.load` finds the weights.
-        licence: the licence that their owner grants; None if it is not known.
+    `name` is what `amvnet.load` takes; `licence` is what the owner of the weights grants, if known.
     """
     abridged = reprlib.Repr()
     abridged.maxdict = 40

@@ -99,12 +99,7 @@ def predict(
 def _report_next(
     inputs: list[str], weights: str, out: str, written: Taxonomy, options: list[str]
 ) -> None:
-    """Report the commands that show the labels, and that train the weights further.
-
-    Args:
-        written: the classes of the labels.
-        options: the options by which the scans were read.
-    """
+    """Report the commands that show the labels of `written` classes, and that train further."""
     from amvnet.data.datasets.open import is_dataset
     from amvnet.data.taxonomy import TAXONOMIES
 

@@ -218,11 +218,7 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
 
 def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str, int]:
-    """Return the indices of the wanted columns that a file has, by key, in any case of letters.
-
-    Args:
-        names: the names of the file's columns, in order.
-    """
+    """Return the indices of the wanted columns that a file has, by key, in any case of letters."""
     lower_names = list(map(str.lower, names))
 
     columns = {}
@@ -256,9 +252,7 @@ def require_columns(
 def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
     """Return the NumPy type of a record; bytes that belong to no column are skipped.
 
-    Args:
-        columns: for each column, its NumPy type and its offset in a record, bytes.
-        size: the size of a record, bytes.
+    Columns have a type and an offset in a record; the offset and the size are in bytes.
     """
     formats, offsets = zip(*columns.values(), strict=True)
     return np.dtype(

@@ -165,11 +165,7 @@ class RangeView:
         return torch.where(is_unknown, self._configured_rows(batch, is_unknown), batch.row)
 
     def _configured_rows(self, batch: PointBatch, which: Tensor | None = None) -> Tensor:
-        """Return the rows (P,) that `RangeViewConfig.rows` asks for.
-
-        Args:
-            which: (P,) bool: the points whose rows are needed; by default all points.
-        """
+        """Return the rows (P,) by `RangeViewConfig.rows`; `which` (P,) says which are needed."""
         if self.config.rows == "ring":
             return self._rows_by_ring(batch.ring, which)
 
