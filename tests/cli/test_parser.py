@@ -40,6 +40,7 @@ WRONG_NAMES = {
 WRONG_VALUES = {
     PREDICT + " --height many": "--height: expected a number, found 'many'",
     PREDICT + " --batch 1.5": "--batch: expected a whole number, found '1.5'",
+    PREDICT + " --batch " + HUGE[:400]: "--batch: expected a number at least 1 and at most 1e+06",
     PREDICT + " --batch 0": "--batch: expected a number at least 1 and at most 1e+06, found '0'",
     PREDICT + " --at-once 0": "--at-once: expected a number at least 1 and at most 1e+06, found",
     PREDICT + " --tau 1.2": "--tau: expected a number at least 0 and at most 1, found '1.2'",

@@ -76,7 +76,7 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
     decoded = net.unet(grid.to_map(pillars))
     vertical = grid.shape[3]
     voxels = net.scores(decoded)[0].unflatten(0, (vertical, -1)).flatten(2)  # (Z, K, R * A)
-    g = voxels[grid.voxel, :, grid.pillar].softmax(dim=1)
+    g = voxels[grid.voxel, :, grid.occupied[grid.slot]].softmax(dim=1)
 
     head = model.point_head
     assert head is not None

@@ -391,7 +391,7 @@ def test_the_networks_scores_are_those_of_each_points_pixel_and_voxel(
     for i in range(30):
         torch.testing.assert_close(scores.rv[i], pixels[:, image.pixel[i]].softmax(0))
         first = int(grid.voxel[i]) * K
-        expected = voxels[first : first + K, grid.pillar[i]].softmax(0)
+        expected = voxels[first : first + K, grid.occupied[grid.slot][i]].softmax(0)
         torch.testing.assert_close(scores.bev[i], expected)
 
 

@@ -349,13 +349,12 @@ def assert_polar_equals_the_loop(scan: Scan) -> None:
     cells, features = polar_view_by_loop(scan.select(scan.valid), POLAR)
     radius, angle, voxel = np.reshape(np.array(cells, np.int64), (-1, 3)).T
     pillars = radius * 17 + angle
-    assert grid.pillar.tolist() == pillars.tolist()
+    assert grid.occupied[grid.slot].tolist() == pillars.tolist()
     assert grid.voxel.tolist() == voxel.tolist()
 
     expected = np.reshape(features, (-1, 9))
     np.testing.assert_allclose(grid.features.numpy(), expected, rtol=1e-6, atol=1e-5)
     assert grid.occupied.tolist() == sorted(set(pillars.tolist()))
-    assert grid.occupied[grid.slot].tolist() == grid.pillar.tolist()
 
 
 @pytest.mark.parametrize(("count", "seed"), [(20_000, 0), (300, 1), (300, 2)])
@@ -374,9 +373,9 @@ def test_points_outside_the_polar_grid_go_to_the_nearest_cell() -> None:
     scan = scan_of((0.5, 0, 0), (100, 0, 0), (10, 0, -50), (10, 0, 50), (-10, 0.0, 0))
     grid = project_to_grid(scan)
 
-    assert (grid.pillar // 17).tolist() == [0, 12, 2, 2, 2]
+    pillars = [0 * 17 + 8, 12 * 17 + 8, 2 * 17 + 8, 2 * 17 + 8, 2 * 17 + 16]
+    assert grid.occupied[grid.slot].tolist() == pillars
     assert grid.voxel.tolist() == [3, 3, 0, 4, 3]
-    assert (grid.pillar % 17).tolist() == [8, 8, 8, 8, 16]
 
 
 def test_pool_is_the_maximum_over_each_pillar(random_scan: RandomScan) -> None:
@@ -384,8 +383,8 @@ def test_pool_is_the_maximum_over_each_pillar(random_scan: RandomScan) -> None:
     features = torch.randn(700, 3) - 5  # nearly all negative, so that a wrong 0 shows
     pooled = grid.pool(features)
 
-    for row, pillar in zip(pooled, grid.occupied, strict=True):
-        assert torch.equal(row, features[grid.pillar == pillar].amax(dim=0))
+    for slot, row in enumerate(pooled):
+        assert torch.equal(row, features[grid.slot == slot].amax(dim=0))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -400,8 +399,8 @@ def test_the_gradient_of_pool_goes_to_the_largest_values_and_equal_ones_share_it
     (pooled * factors).sum().backward()
 
     expected = torch.zeros_like(features)
-    for pillar, factor in zip(grid.occupied, factors, strict=True):
-        of_pillar = grid.pillar == pillar
+    for slot, factor in enumerate(factors):
+        of_pillar = grid.slot == slot
         is_largest = (features == features[of_pillar].amax(dim=0)) & of_pillar[:, None]
         expected += is_largest * (factor / is_largest.sum(dim=0))
     torch.testing.assert_close(features.grad, expected)
@@ -447,10 +446,11 @@ def test_a_batch_of_polar_grids_equals_one_by_one(random_scan: RandomScan) -> No
     together = project_to_grid(*scans)
     maps = together.to_map(together.pool(together.features))
 
+    pillars = together.occupied[together.slot]
     for b, (scan, rows) in enumerate(zip(scans, slices, strict=True)):
         alone = project_to_grid(scan)
         assert torch.equal(together.features[rows], alone.features)
-        assert torch.equal(together.pillar[rows] - b * 13 * 17, alone.pillar)
+        assert torch.equal(pillars[rows] - b * 13 * 17, alone.occupied[alone.slot])
         assert torch.equal(together.voxel[rows], alone.voxel)
         assert torch.equal(maps[b], alone.to_map(alone.pool(alone.features))[0])
 
@@ -539,7 +539,7 @@ def test_points_at_the_borders_of_cells_have_the_cells_of_double_precision() -> 
     cells, _ = polar_view_by_loop(scan, POLAR)
     assert project_to_image(scan).pixel.tolist() == pixels
     grid = project_to_grid(scan)
-    assert grid.pillar.tolist() == [r * POLAR.angular + a for r, a, _ in cells]
+    assert grid.occupied[grid.slot].tolist() == [r * POLAR.angular + a for r, a, _ in cells]
 
     # In single precision, other cells would come out.
     shares = 0.5 - np.arctan2(xyz[:, 1], xyz[:, 0]) / np.float32(2 * math.pi)

@@ -68,7 +68,7 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
     for scan in range(2):
         members: dict[tuple[int, int], list[int]] = {}
         for point in (batch.scan == scan).nonzero()[:, 0].tolist():
-            key = (int(grid.pillar[point]), int(grid.voxel[point]))
+            key = (int(grid.slot[point]), int(grid.voxel[point]))
             members.setdefault(key, []).append(point)
 
         expected = []

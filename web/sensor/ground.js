@@ -1,6 +1,6 @@
 // Find the ground in a scan: the plane that holds most of the lowest points around the sensor.
 
-import { drawing, quantilesOf } from "./statistics.js";
+import { quantilesOf, seededRandom } from "./statistics.js";
 
 export const NEAREST = 1.0;  // the least distance of points that are used, metres; the vehicle is nearer
 const CELL = 1.0;  // the side of the cells whose lowest points are used, metres
@@ -104,7 +104,7 @@ function lowestPoints(points) {
 
 /** Return [a, b, c] of the plane z = a x + b y + c that agrees with most low points; null if all are too steep. */
 function bestPlane(low) {
-  const draw = drawing(), ends = [];
+  const draw = seededRandom(), ends = [];
   low.reduce((sum, { weight }) => (ends.push(sum + weight), sum + weight), 0);
   const drawn = () => {
     const place = draw() * ends.at(-1);

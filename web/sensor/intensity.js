@@ -3,7 +3,7 @@
 
 import { counted } from "../errors.js";
 import { measuredIntensities } from "../reading/cloud.js";
-import { drawing, interpolate, quantilesOf } from "./statistics.js";
+import { interpolate, quantilesOf, seededRandom } from "./statistics.js";
 
 // The quantiles at these probabilities describe a distribution of intensities.
 const PROBABILITIES = [0.001, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999];
@@ -106,7 +106,7 @@ function areAlike(a, b) {
 /** Return intensities for a scan that has none: zeros for networks that do not need them, else seeded random ones. */
 function filler(count, trained) {
   if (!trained || trained.is_optional) return new Float32Array(count);
-  const draw = drawing();
+  const draw = seededRandom();
   return Float32Array.from({ length: count }, () => interpolate(draw(), PROBABILITIES, trained.quantiles));
 }
 

@@ -28,8 +28,8 @@ class PastFusion:
     or if the odometry jumps. A scan without a pose is labelled alone.
 
     Args:
-        find_pose: returns the pose of a scan, given its message and whether its time is before that
-            of the last scan, or None if there is no pose.
+        find_pose: takes the stamp and the frame of a scan, and whether its time is before the time
+            of the last scan; returns the pose of the scan, or None if there is no pose.
     """
 
     def __init__(self, find_pose: FindPose) -> None:

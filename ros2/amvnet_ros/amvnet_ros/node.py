@@ -77,17 +77,17 @@ class SegmentNode(Node):
         find_pose = None
         if self._odom_frame:
             self._frames = Buffer()
-            self._listener = TransformListener(self._frames, self)
+            self._listener = TransformListener(self._frames, self)  # fills the buffer
             find_pose = self._find_pose
         self._segment = CloudSegmenter(settings, topic, self.get_logger().info, find_pose)
         self._hardware = self._segment.hardware
         self._health = Health(self._segment.usual_uncertain)
         self._report_time = time.monotonic()
 
-        self._labels = self._create_cloud_publisher("~/labels")
-        self._cloud = self._create_cloud_publisher("~/cloud")
-        self._classes = self.create_publisher(String, "~/classes", latched_profile())
-        self._classes.publish(String(data=self._segment.classes()))
+        self._label_publisher = self._create_cloud_publisher("~/labels")
+        self._cloud_publisher = self._create_cloud_publisher("~/cloud")
+        class_publisher = self.create_publisher(String, "~/classes", latched_profile())
+        class_publisher.publish(String(data=self._segment.classes()))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
         self._worker = NewestOnly(self._label, self._fail)
@@ -135,10 +135,10 @@ class SegmentNode(Node):
             return
 
         # Encoding takes time, so only messages with a subscriber are encoded.
-        if self._labels.get_subscription_count():
-            self._labels.publish(to_ros(labelled, has_points=False))
-        if self._cloud.get_subscription_count():
-            self._cloud.publish(to_ros(labelled, has_points=True))
+        if self._label_publisher.get_subscription_count():
+            self._label_publisher.publish(to_ros(labelled, has_points=False))
+        if self._cloud_publisher.get_subscription_count():
+            self._cloud_publisher.publish(to_ros(labelled, has_points=True))
 
         age = self.get_clock().now().nanoseconds - labelled.origin.stamp
         self._health.label(
@@ -167,6 +167,7 @@ class SegmentNode(Node):
                 timeout=Duration(seconds=ODOMETRY_WAIT),
             )
             place, turn = found.transform.translation, found.transform.rotation
+            # A row of TUM's format: time (does not matter here), place and quaternion.
             row = [0.0, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
             return timed_poses(self._odom_frame, np.array([row])).poses[0]
         except (TransformException, InputError) as error:
@@ -177,7 +178,7 @@ class SegmentNode(Node):
             return None
 
     def _fail(self, error: Exception) -> None:
-        """End the node: the error is not due to the message, so that it would come again."""
+        """End the node: the error is not due to the message, so the next one would cause it too."""
         if not self.context.ok():  # the node was stopped while it labelled
             return
         self.exit_code = FAILED
@@ -189,9 +190,7 @@ class SegmentNode(Node):
         report = self._health.report(now - self._report_time)
         self._report_time = now
 
-        values = []
-        for key, value in report.values.items():
-            values.append(KeyValue(key=key, value=value))
+        values = [KeyValue(key=key, value=value) for key, value in report.values.items()]
         status = DiagnosticStatus(
             level=getattr(DiagnosticStatus, report.level.value),
             name=f"{self.get_name()}: segmentation",

@@ -89,8 +89,7 @@ class CloudSegmenter:
         settings: the parameters of the node.
         topic: the topic of the messages, for lines of the log.
         report: called once with what was assumed about the sensor.
-        find_pose: returns the pose of a scan, given its message and whether its time is before that
-            of the last scan, or None if there is no pose. Without it, no scans are fused.
+        find_pose: as `PastFusion` takes it. Without it, no scans are fused.
 
     Raises:
         InputError: if a parameter is wrong.

@@ -60,9 +60,9 @@ class SafeStream:
         except (OSError, ValueError, AttributeError) as error:  # after >&- the stream is None
             with suppress(OSError, ValueError, AttributeError), open(os.devnull, "w") as nothing:
                 os.dup2(nothing.fileno(), self._stream.fileno())
-            if not isinstance(error, OSError) or self.name == "stderr":
-                return
-            if error.errno != errno.EPIPE:  # a reader such as head has read enough
+            if not isinstance(error, OSError) or error.errno == errno.EPIPE:
+                return  # the stream is closed, or a reader such as head has read enough
+            if self.name == "stdout":
                 report_fault(f"stdout cannot be written ({error.strerror}); the work goes on")
 
 

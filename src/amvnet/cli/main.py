@@ -34,15 +34,12 @@ from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
-# The functions of the commands, in the order of the help.
+# The functions of the commands, in the order of the help; two parts fit into two lines.
 _FIRST = (demo, simulate, check, train, adapt, predict, fleet, evaluate, map_drive, submit, fuse)
 _LAST = (rank, analyze, ablate, export, view, bench, list_names, info)
 COMMANDS = {function.__name__: function for function in _FIRST + _LAST}
 WITH_RESUME = ("train", "adapt", "map", "predict", "fleet")  # commands that have --resume
-CONTINUED_WHEN_REPEATED = (
-    "simulate",
-    "ablate",
-)  # commands that keep the results of an earlier call
+CONTINUED_WHEN_REPEATED = ("simulate", "ablate")  # commands that keep results of an earlier call
 WITH_PROCESSES = ("train", "evaluate", "ablate")  # commands whose work several processes can share
 WITH_RECIPE = ("train", "ablate")  # commands whose options are also the values of a recipe
 
@@ -73,10 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             except BaseException:  # libraries turn an interruption into exceptions of their own
                 if stop.signal is None:
                     raise
-            if stop.signal is not None:
-                stop.end()
-                code = stop.exit_code
-        return code
+            return code if stop.signal is None else stop.end()
     finally:
         stdout.flush()  # because the interpreter's own flush at the end could fail
 
@@ -162,10 +156,10 @@ def _parse_with_recipe(command: str, arguments: Sequence[str]) -> dict[str, Any]
     # The help shows the values of the recipe that is named, or else the values of the paper.
     asks_for_help = bool({"-h", "--help", HELP_ALL} & set(arguments))
     names_recipe = bool(arguments) and not arguments[0].startswith("-")
-    shown = load_recipe(arguments[0]) if asks_for_help and names_recipe else Recipe()
+    in_help = load_recipe(arguments[0]) if asks_for_help and names_recipe else Recipe()
 
     parser = make_parser(command, COMMANDS[command])
-    add_recipe(parser, shown, shows_all=HELP_ALL in arguments)
+    add_recipe(parser, in_help, shows_all=HELP_ALL in arguments)
     values = parser.values(arguments)
     values["recipe"] = with_options(load_recipe(values["recipe"]), values)
     return values

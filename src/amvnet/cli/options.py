@@ -18,7 +18,7 @@ from amvnet.progress import counted
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.data.datasets.training_data import Source
-    from amvnet.inference.drive import DriveChoice
+    from amvnet.inference.drive import DriveOptions
     from amvnet.inference.listing import ScanOptions
     from amvnet.inference.request import LabellingRequest
     from amvnet.inference.scores import ScorePair
@@ -110,7 +110,7 @@ class TrainingChoice:
         Scans that are not used are reported.
 
         Args:
-            with_val: whether to train on the scans to validate with as well.
+            with_val: whether to also train on the scans of the validation, and validate with none.
 
         Raises:
             InputError: if there are no such sequences, or no scans to train on.
@@ -136,7 +136,9 @@ class TrainingChoice:
         _report_unnamed(Source.labelled(dataset, train, val))
         splits = {"train": dataset.records(train), "val": dataset.records(val)}
         test = dataset.having_labels(dataset.records(dataset.splits().get("test", ())))
-        return splits | ({"test": test} if test else {})
+        if test:
+            splits["test"] = test
+        return splits
 
 
 def report_unused(source: Source, title: str = "") -> None:
@@ -246,7 +248,7 @@ class LabelChoice:
 
 
 @dataclass(frozen=True)
-class DriveOptions:
+class DriveChoice:
     """Whether the scores of drives are fused over time."""
 
     drive: bool = False
@@ -259,16 +261,16 @@ class DriveOptions:
     past_only: bool = False
     """with --drive, fuse each scan only with scans before it, as on a robot."""
 
-    def parse(self) -> DriveChoice | None:
+    def parse(self) -> DriveOptions | None:
         """Return how drives are fused, or None if each scan is labelled alone.
 
         Raises:
             InputError: if an option needs --drive.
         """
-        from amvnet.inference.drive import DriveChoice
+        from amvnet.inference.drive import DriveOptions
 
         if self.drive:
-            return DriveChoice(self.poses, self.past_only)
+            return DriveOptions(self.poses, self.past_only)
         for flag, is_given in (("--poses", self.poses), ("--past-only", self.past_only)):
             if is_given:
                 raise InputError(f"{flag}: expected --drive, found none; add it")
@@ -308,7 +310,7 @@ class ScoresChoice:
         )
 
 
-def given(choice: Any) -> list[str]:
+def given_options(choice: Any) -> list[str]:
     """Return the options of a choice whose values are not the defaults, as words of a command."""
     words = []
     for field in fields(choice):

@@ -19,7 +19,6 @@ from amvnet.config.bounds import Range
 from amvnet.errors import InputError, did_you_mean, shown
 from amvnet.sensors.lidars import BUILT_IN
 
-OF_THIS_NAME = "for the file of this name, give"  # advice about a file that looks like an option
 NUMBERS = {int: "a whole number", float: "a number"}  # what messages call the types of numbers
 # What stands for an argument in the help. Other arguments are shown by their name in capitals.
 METAVARS = {"inputs": "INPUT", "weights": "W"}
@@ -54,15 +53,14 @@ class Parser(argparse.ArgumentParser):
         unknown = re.match(r"unrecognized arguments: (.*)", line)
         missing = re.match(r"the following arguments are required: (.*)", line)
         if unknown is not None:
-            line = self._unknown(unknown[1])
-        elif missing is not None:
-            # A misspelt option helps the user more than the missing option.
+            raise InputError(self._unknown(unknown[1]))
+        if missing is not None:
             wrong = self._wrong_option()
+            if wrong is not None:  # helps the user more than the missing option
+                raise InputError(self._unknown(wrong))
             built_in = f" (built in: {', '.join(BUILT_IN)})" if "--weights" in missing[1] else ""
             line = f"expected {missing[1]}, found none; add what is missing{built_in}"
-            line = line if wrong is None else self._unknown(wrong)
-        is_advice = line.endswith("?") or OF_THIS_NAME in line
-        raise InputError(line if is_advice else f"{line}; see {self.prog} --help")
+        raise InputError(f"{line}; see {self.prog} --help")
 
     def print_help(self, file: Any = None) -> None:
         """Print the help to the console; `file` is argparse's, and not used."""
@@ -88,21 +86,23 @@ class Parser(argparse.ArgumentParser):
         for word in self._words:
             if word == "--":
                 break
-            is_number = self._negative_number_matcher.match(word) or word == "-"
-            if word.startswith("-") and not is_number and word.split("=")[0] not in self._flags():
+            is_value = self._negative_number_matcher.match(word) or word == "-"
+            if word.startswith("-") and not is_value and word.split("=")[0] not in self._flags():
                 return word
         return None
 
     def _unknown(self, words: str) -> str:
         """Return the message about words that are no options, joined by spaces as by argparse."""
+        see_help = f"see {self.prog} --help"
         if not words.startswith("-"):
-            return f"expected nothing more, found {words}; leave it out"
+            return f"expected nothing more, found {words}; leave it out; {see_help}"
         word = next((word for word in self._words if word and words.startswith(word)), words)
         if os.path.lexists(word):
-            return f"expected an option of {self.prog}, found {word}; {OF_THIS_NAME} ./{word}"
+            advice = f"for the file of this name, give ./{word}"
+            return f"expected an option of {self.prog}, found {word}; {advice}"
         flag = word.split("=")[0]
-        flags = self._flags()
-        return f"expected an option of {self.prog}, found {flag}{did_you_mean(flag, flags)}"
+        meant = did_you_mean(flag, self._flags(), f"correct it; {see_help}")
+        return f"expected an option of {self.prog}, found {flag}{meant}"
 
 
 def _convert(flag: str, text: str, kind: Any) -> Any:
@@ -124,24 +124,22 @@ def _convert(flag: str, text: str, kind: Any) -> Any:
             + did_you_mean(text, choices)
         )
 
-    kinds = list(_parts_of(kind))
-    for number, words in NUMBERS.items():
-        if number not in kinds:
-            continue
-        try:
-            value = number(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise InputError(f"{flag}: expected {words}, found {shown(text)}; correct it")
-        for allowed in kinds:
-            if isinstance(allowed, Range) and value not in allowed:
-                raise InputError(
-                    f"{flag}: expected a number {allowed}, found {shown(text)}; correct it"
-                )
-        return value
-
-    return Path(text) if Path in kinds else text
+    parts = list(_parts_of(kind))
+    number = next((number for number in NUMBERS if number in parts), None)
+    if number is None:
+        return Path(text) if Path in parts else text
+    try:
+        value = number(text)
+    except ValueError:
+        value = math.nan
+    if isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{flag}: expected {NUMBERS[number]}, found {shown(text)}; correct it")
+    for allowed in parts:
+        if isinstance(allowed, Range) and value not in allowed:
+            raise InputError(
+                f"{flag}: expected a number {allowed}, found {shown(text)}; correct it"
+            )
+    return value
 
 
 def _item_kind_of(kind: Any) -> Any:

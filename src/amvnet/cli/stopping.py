@@ -31,12 +31,6 @@ class Stop:
         self.signal: int | None = None
         self._process = os.getpid()
 
-    @property
-    def exit_code(self) -> int:
-        """The number of the signal + 128: 130 after Ctrl-C, 143 after SIGTERM."""
-        assert self.signal is not None
-        return 128 + self.signal
-
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt; end the command at once if it is the second signal."""
         if os.getpid() != self._process:  # a forked worker, which has inherited this handler
@@ -47,14 +41,17 @@ class Stop:
             self.end()
         raise KeyboardInterrupt
 
-    def end(self) -> None:
-        """Report that the command has stopped. End the process if it belongs to the command line.
+    def end(self) -> int:
+        """Report that the command has stopped, and return its exit code: 128 + the signal's number.
 
-        No half-written file is left. Threads that still compute are not waited for.
+        A process that belongs to the command line ends here. No half-written file is left. Threads
+        that still compute are not waited for.
         """
+        assert self.signal is not None
+        code = 128 + self.signal
         report_fault(self.line)
         if not self.exits:
-            return
+            return code
 
         for path in list(unfinished):
             if path.is_dir():
@@ -63,7 +60,7 @@ class Stop:
                 path.unlink(missing_ok=True)
         console.show_cursor()  # because a progress bar hides it
         stdout.flush()
-        os._exit(self.exit_code)
+        os._exit(code)
 
 
 @contextmanager

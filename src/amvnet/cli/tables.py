@@ -29,7 +29,6 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     The overall figures and the mIoU by distance follow below the classes.
     """
     methods = report["methods"]
-    figures = list(methods.values())
     title = f"{report['dataset']}: {counted(report['scans'], 'scan')}, {report['points']:,} points"
     if "tau" in report:
         title += f", tau: {report['tau']}"
@@ -39,13 +38,13 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
         table.add_column(title_of(name), justify="right")
 
     for name in taxonomy.classes:
-        table.add_row(name, *[_percent(method["iou"][name]) for method in figures])
+        table.add_row(name, *[_percent(method["iou"][name]) for method in methods.values()])
     table.add_section()
     for key, row_title in OVERALL.items():
-        table.add_row(row_title, *[_percent(method[key]) for method in figures])
+        table.add_row(row_title, *[_percent(method[key]) for method in methods.values()])
     table.add_section()
     # Each row is a range of distances, and has the figures of all methods.
-    for row in zip(*[method["by_distance"] for method in figures], strict=True):
+    for row in zip(*[method["by_distance"] for method in methods.values()], strict=True):
         row_title = f"mIoU, {row[0]['from_m']:.0f} to {row[0]['to_m']:.0f} m"
         table.add_row(row_title, *[_percent(figure["miou"]) for figure in row])
 
@@ -65,7 +64,7 @@ def contents_table(report: Report) -> Table:
         table.add_column("scans", justify="right")
 
     names = ("ignored", *report.taxonomy.classes)
-    for train_id in (*range(1, len(names)), 0):
+    for train_id in (*range(1, len(names)), 0):  # ignored points last
         cells = []
         for split in splits.values():
             points = int(split.points[train_id])
@@ -171,9 +170,7 @@ def recipes_table() -> Table:
         table.add_column(name)
     for name in recipe_names():
         recipe = load_recipe(name)
-        epochs = []
-        for stage in recipe.stages:
-            epochs.append(f"{stage} {getattr(recipe.training, stage).epochs}")
+        epochs = [f"{stage} {getattr(recipe.training, stage).epochs}" for stage in recipe.stages]
         image = recipe.model.range_view
         table.add_row(
             name,

@@ -30,13 +30,13 @@ class Range:
         return f"{above} {self.low:g} and {below} {self.high:g}"
 
 
-MAX_TEXT_LENGTH = 200  # largest number of characters in a text of a file
+MAX_TEXT_LENGTH = 200  # largest number of characters in a text from a file
 MAX_ITEMS = 12  # largest number of values in a list, such as the channels of a network's layers
 Count = Annotated[int, Range(1, 1_000_000)]  # number of items; the limit is far above any use
 Share = Annotated[float, Range(0, 1)]  # share of a whole
 
 
-class Checked:
+class Bounded:
     """A base class of dataclasses whose numbers must be finite and in their `Range`."""
 
     def __post_init__(self) -> None:
@@ -47,20 +47,19 @@ class Checked:
                 such number.
         """
         kinds = get_type_hints(type(self), include_extras=True)
-        for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
+        for field in fields(self):  # type: ignore[arg-type]
+            name = field.name
             value = getattr(self, name)
-            kind = kinds[name]
-            if isinstance(value, tuple):
-                self.check(
-                    holds=len(value) <= MAX_ITEMS,
-                    expected=f"at most {MAX_ITEMS} values of {name}",
-                    found=str(len(value)),
-                )
-                item_kind = get_args(kind)[0]
-                for item in value:
-                    _check_range(name, item, item_kind)
-            else:
-                _check_range(name, value, kind)
+            if not isinstance(value, tuple):
+                _check_range(name, value, kinds[name])
+                continue
+            self.check(
+                holds=len(value) <= MAX_ITEMS,
+                expected=f"at most {MAX_ITEMS} values of {name}",
+                found=str(len(value)),
+            )
+            for item in value:
+                _check_range(name, item, get_args(kinds[name])[0])
 
     def check(self, holds: bool, expected: str, found: str) -> None:
         """Check a condition on several numbers; raise InputError if the condition does not hold."""

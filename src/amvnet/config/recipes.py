@@ -1,4 +1,4 @@
-"""Read recipes, built-in recipes and users' own. A recipe says what to train and how."""
+"""Read built-in recipes and users' own recipes. A recipe says what to train and how."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
 
     tree = read_yaml(_find(name_or_path), "a recipe")
 
-    # An empty file, perhaps from an interrupted download, would train at the paper's sizes.
+    # An empty file, perhaps from an interrupted download, must not train at the paper's sizes.
     if not isinstance(tree, dict) or not tree:
         found = shown(tree) if tree else "an empty file"
         raise InputError(

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from amvnet.config.bounds import Checked, Range, Share
+from amvnet.config.bounds import Bounded, Range, Share
 
 StageName = Literal["rv", "bev", "head"]
 
@@ -32,7 +32,7 @@ LearningRate = Annotated[float, Range(0, 100, open=True)]
 Factor = Annotated[float, Range(0, 1000)]
 
 
-def _check_cells(view: Checked, *sides: int) -> None:
+def _check_cells(view: Bounded, *sides: int) -> None:
     view.check(
         holds=math.prod(sides) <= MAX_CELLS,
         expected=f"at most {MAX_CELLS} cells",
@@ -41,7 +41,7 @@ def _check_cells(view: Checked, *sides: int) -> None:
 
 
 @dataclass(frozen=True)
-class RangeViewConfig(Checked):
+class RangeViewConfig(Bounded):
     """The range image (section 3.1 of the paper; section 4.2 has its sizes)."""
 
     rows: Literal["elevation", "laser", "ring"] = "elevation"
@@ -86,7 +86,7 @@ class RangeViewConfig(Checked):
 
 
 @dataclass(frozen=True)
-class PolarViewConfig(Checked):
+class PolarViewConfig(Bounded):
     """The polar grid (section 3.1 of the paper and 3 of PolarNet's; section 4.2 has its sizes)."""
 
     radial: Cells = 480
@@ -124,7 +124,7 @@ class PolarViewConfig(Checked):
 
 
 @dataclass(frozen=True)
-class RangeNetConfig(Checked):
+class RangeNetConfig(Bounded):
     """The range-view network (sections 3.1 and 4.2 of the paper; its widths are open).
 
     With these defaults, an image of 64 x 4096 costs 500 GMAC (billion multiply-adds). This is what
@@ -168,7 +168,7 @@ class RangeNetConfig(Checked):
 
 
 @dataclass(frozen=True)
-class PolarNetConfig(Checked):
+class PolarNetConfig(Bounded):
     """The bird's-eye-view network: PolarNet (Zhang et al., CVPR 2020)."""
 
     point_widths: tuple[Channels, ...] = (64, 128, 256, 512)
@@ -191,7 +191,7 @@ class PolarNetConfig(Checked):
 
 
 @dataclass(frozen=True)
-class AssertionConfig(Checked):
+class AssertionConfig(Bounded):
     """The assertion that decides which points are uncertain (section 3.2 of the paper)."""
 
     threshold: Share = 0.85
@@ -199,7 +199,7 @@ class AssertionConfig(Checked):
 
 
 @dataclass(frozen=True)
-class PointHeadConfig(Checked):
+class PointHeadConfig(Bounded):
     """The point head (section 3.3 of the paper)."""
 
     neighbours: Annotated[int, Range(1, 1000)] = 15
@@ -220,7 +220,7 @@ class PointHeadConfig(Checked):
 
 
 @dataclass(frozen=True)
-class ModelConfig(Checked):
+class ModelConfig(Bounded):
     """The whole model."""
 
     range_view: RangeViewConfig = RangeViewConfig()
@@ -238,7 +238,7 @@ class ModelConfig(Checked):
 
 
 @dataclass(frozen=True)
-class AugmentConfig(Checked):
+class AugmentConfig(Bounded):
     """Augmentation of the points in training (section 3.1 of the paper lists the kinds)."""
 
     scale: Annotated[float, Range(0, 0.99)] = 0.05
@@ -283,7 +283,7 @@ class AugmentConfig(Checked):
 
 
 @dataclass(frozen=True)
-class NetworkTraining(Checked):
+class NetworkTraining(Bounded):
     """Training of one network: an optimizer and a one-cycle schedule (section 4.2 of the paper)."""
 
     epochs: Epochs
@@ -336,7 +336,7 @@ class NetworkTraining(Checked):
 
 
 @dataclass(frozen=True)
-class HeadTraining(Checked):
+class HeadTraining(Bounded):
     """Training of the head on frozen networks: SGD, one-cycle (section 4.2 of the paper)."""
 
     epochs: Epochs = 20
@@ -371,7 +371,7 @@ class HeadTraining(Checked):
 
 
 @dataclass(frozen=True)
-class TrainingConfig(Checked):
+class TrainingConfig(Bounded):
     """The stages of training."""
 
     rv: NetworkTraining = NetworkTraining(epochs=160, batch=32, lr=4e-3)

@@ -37,7 +37,7 @@ LEAST_SCANS = 2  # smallest number of scans of a drive
 
 
 @dataclass(frozen=True)
-class DriveChoice:
+class DriveOptions:
     """How the scores of drives are fused over time.
 
     Attributes:

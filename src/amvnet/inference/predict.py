@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.inference.drive import DriveChoice, Drives, find_poses, key_of
+from amvnet.inference.drive import DriveOptions, Drives, find_poses, key_of
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_output
@@ -33,7 +33,7 @@ def predict(
     output: OutputOptions,
     options: ScanOptions,
     *,
-    drive: DriveChoice | None = None,
+    drive: DriveOptions | None = None,
     batch: int = 1,
     progress: Progress = no_progress,
     report: Reporter = report_nothing,

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from amvnet.config.bounds import Checked
+from amvnet.config.bounds import Bounded
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
@@ -24,7 +24,7 @@ UNKNOWN_SENSOR = Sensor()
 
 
 @dataclass(frozen=True)
-class LabellingRequest(Checked):
+class LabellingRequest(Bounded):
     """A request for labels: it holds all that label files depend on, except the scans themselves.
 
     Attributes:

@@ -107,7 +107,7 @@ def adapt(
 def _score_on(
     val: str, sequences: tuple[str, ...] | None, weights: Weights
 ) -> Callable[[Segmenter], float]:
-    """Return a function that returns the mIoU of a segmenter on labelled scans."""
+    """Return a function that returns the mIoU of a segmenter on labelled scans, in [0, 1]."""
     from amvnet.data.datasets.open import open_dataset
     from amvnet.evaluation.scoring import evaluate, label_by_weights
     from amvnet.inference.reading import normalised

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def check(data: str, /, choice: TrainingChoice) -> None:
     """Check the labels of all scans to train on, to validate with and to test on.
 
-    If too few sequences are there for a training, the labels of those are checked all the same.
+    If there are too few sequences for a training, their labels are checked before this is said.
 
     Args:
         data: the dataset.
@@ -27,11 +27,11 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     from amvnet.inference.reading import described_sensor
 
     dataset = open_dataset(data)
-    described_sensor(dataset)
+    described_sensor(dataset)  # raises if there is no such sensor
     try:
         splits = choice.splits(dataset)
     except InputError:
-        if choice == TrainingChoice():
+        if choice == TrainingChoice():  # the error is not about names that the user gave
             _check(dataset, {"all": dataset.records(dataset.trainable())})
         raise
     scans = _check(dataset, splits)
@@ -39,7 +39,10 @@ def check(data: str, /, choice: TrainingChoice) -> None:
 
 
 def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanRecord]]) -> int:
-    """Print what the labels of some scans are, and return the number of scans."""
+    """Print what is in the labels of some scans, and return the number of scans.
+
+    If something must be corrected, raise InputError; if only some scans are broken, SomeBroken.
+    """
     from amvnet.cli.tables import contents_table, unknown_table
     from amvnet.data.check import check_scans
 
@@ -53,11 +56,11 @@ def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanRecord]]) -> int:
         report(line)
 
     broken = checked.broken
-    errors = list(checked.errors())
-    if errors:
+    error = next(checked.errors(), None)
+    if error is not None:
         for message in broken.values():
             report(f"broken: {message}")
-        raise InputError(errors[0])
+        raise InputError(error)
     if broken:
         found = counted(len(broken), "broken scan")
         pronoun = "it" if len(broken) == 1 else "them"

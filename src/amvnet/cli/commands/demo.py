@@ -9,9 +9,9 @@ from amvnet.cli.console import progress, report, report_lines
 from amvnet.cli.options import WEIGHTS
 
 SEED = 20_201_209  # the default seed, far from the seeds of the built-in weights' training streets
-# With fewer streets, chance decides whether AMVNet or the ensemble is ahead (docs/log.md).
 SCANS = 2  # number of scans of each street
-SEQUENCES = 20  # number of streets
+# Number of streets. With fewer, chance decides whether AMVNet is ahead (docs/log.md).
+SEQUENCES = 20
 CAPTION = """\
 RV and BEV are the two networks, and the ensemble is their mean.
 In AMVNet, a small head decides where the networks disagree.

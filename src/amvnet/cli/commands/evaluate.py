@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report, show
-from amvnet.cli.options import DriveOptions, LabelledChoice, join_processes, load_segmenter
+from amvnet.cli.options import DriveChoice, LabelledChoice, join_processes, load_segmenter
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -26,7 +26,7 @@ def evaluate(
     /,
     choice: LabelledChoice,
     compute: Compute,
-    time: DriveOptions,
+    drive_choice: DriveChoice,
     weights: str | None = None,
     predictions: Path | None = None,
     methods: tuple[MethodName, ...] = PAPER_METHODS,
@@ -42,7 +42,8 @@ def evaluate(
         data: the dataset.
         choice: which scans to score.
         compute: where and how the networks are computed.
-        time: with --weights, whether to score the fusion over time as well, as the method drive.
+        drive_choice: with --weights, whether to also score the fusion over time, as the method
+            drive.
         weights: a weights file, or the name of built-in weights.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
         methods: with --weights, the methods to score, separated by commas; rv-knn is rv with a vote
@@ -78,22 +79,26 @@ def evaluate(
     processes = join_processes()
     drives = None
     mapping = None if classes is None else class_map(classes)
-    if weights is not None and predictions is None:
+    if (weights is None) == (predictions is None):
+        raise InputError(
+            "expected either --weights or --predictions, found both or neither; give one of them"
+        )
+    if weights is not None:
         loaded = load(weights)
         opened = open_dataset(data, loaded.taxonomy if mapping is None else None)
         dataset = normalised(opened, Normaliser(loaded.expects))
         records = choice.records(dataset)
         check_files(records)
-        drives = _find_drives(time, dataset, records, processes.size)
-        _check_methods(methods, weights, loaded.parts, processes.first)
+        drives = _find_drives(drive_choice, dataset, records, processes.size)
+        _check_methods(methods, weights, loaded.parts)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]
         device = processes.device(choose_device(compute.device, compute.engine))
         compute = replace(compute, device=device)
         segmenter = load_segmenter(loaded, widest_method(parts), compute, tau)
         labeller = label_by_weights(dataset, segmenter, methods, mapping)
-    elif predictions is not None and weights is None:
-        for flag, is_given in (("--tau", tau is not None), ("--drive", time.drive)):
+    elif predictions is not None:
+        for flag, is_given in (("--tau", tau is not None), ("--drive", drive_choice.drive)):
             if is_given:
                 raise InputError(
                     f"{flag}: expected --weights, found --predictions; leave {flag} out"
@@ -102,14 +107,9 @@ def evaluate(
         records = choice.records(dataset)
         check_files(records)
         labeller = label_from_files(dataset, predictions, mapping)
-    else:
-        raise InputError(
-            "expected either --weights or --predictions, found both or neither; give one of them"
-        )
 
-    for path in (json, pictures):
-        if path is not None:
-            make_folder(path.parent)
+    for path in filter(None, (json, pictures)):
+        make_folder(path.parent)
     # Another process might take a drawing of this run for one that existed before.
     processes.wait()
     with progress("scoring") as step:
@@ -127,7 +127,7 @@ def evaluate(
 
 
 def _find_drives(
-    time: DriveOptions, dataset: Dataset, records: Sequence[ScanRecord], processes: int
+    choice: DriveChoice, dataset: Dataset, records: Sequence[ScanRecord], processes: int
 ) -> Drives | None:
     """Return the poses of the scans, if their scores are to be fused over time.
 
@@ -137,28 +137,26 @@ def _find_drives(
     from amvnet.inference.drive import find_poses
     from amvnet.inference.listing import DatasetScan
 
-    chosen = time.parse()
-    if chosen is None:
+    options = choice.parse()
+    if options is None:
         return None
     if processes > 1:
         raise InputError("--drive: expected one process, found several; start it without torchrun")
     scans = [DatasetScan(dataset, record) for record in records]
-    return find_poses(scans, chosen.poses, chosen.past_only, report=report)
+    return find_poses(scans, options.poses, options.past_only, report=report)
 
 
-def _check_methods(
-    methods: tuple[MethodName, ...], weights: str, parts: tuple[str, ...], is_first: bool
-) -> None:
-    """Let the first process say which methods the weights lack parts for.
+def _check_methods(methods: tuple[MethodName, ...], weights: str, parts: tuple[str, ...]) -> None:
+    """Report the methods for which the weights lack parts.
 
     Raises:
         InputError: if they lack parts for all methods.
     """
     scored = methods_of(parts, methods)
     if not scored:
-        check_method(methods[0], parts)
+        check_method(methods[0], parts)  # raises
     left_out = [name for name in methods if name not in scored]
-    if left_out and is_first:
+    if left_out:
         report(f"not scored: {', '.join(left_out)}, because {weights} has only {', '.join(parts)}")
 
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report, show
 from amvnet.cli.options import (
-    DriveOptions,
+    DriveChoice,
     LabelChoice,
     ScanChoice,
     SensorChoice,
-    given,
+    given_options,
     load_segmenter,
 )
 from amvnet.config.bounds import Count
@@ -34,7 +34,7 @@ def predict(
     sensor_choice: SensorChoice,
     compute: Compute,
     labels: LabelChoice,
-    time: DriveOptions,
+    drive_choice: DriveChoice,
     batch: Count = 1,
     resume: bool = False,
     overwrite: bool = False,
@@ -49,7 +49,7 @@ def predict(
         sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
         labels: how points are labelled, and which files are written.
-        time: whether the scores of drives are fused over time.
+        drive_choice: whether the scores of drives are fused over time.
         batch: number of scans that go through the networks together; more than one suits a GPU.
         resume: continue an earlier run in the folder, with the same weights and options; segment
             only scans that are new or were not finished.
@@ -67,7 +67,7 @@ def predict(
             raise InputError(f"{text}: expected a path, found a URL; use amvnet fleet")
     compute = resolved(compute)  # the labels depend on what "auto" is
     request = labels.parse(load(weights), choice, sensor_choice, compute)
-    also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, time.poses)
+    also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, drive_choice.poses)
 
     def make_segmenter() -> Segmenter:
         return load_segmenter(request.weights, request.method, compute, request.tau)
@@ -79,7 +79,7 @@ def predict(
             make_segmenter,
             request.output(Path(out), overwrite, resume, also_read),
             choice.parse(),
-            drive=time.parse(),
+            drive=drive_choice.parse(),
             batch=batch,
             progress=step,
             report=report,
@@ -93,7 +93,8 @@ def predict(
         report(f"warning: {request.weights.weakness}")
     check_faults(faults, len(entries) + len(faults))
     report(f"{counted(len(entries), 'label file')} in {out}")
-    _report_next(inputs, weights, out, request.taxonomy, [*given(choice), *given(sensor_choice)])
+    options = [*given_options(choice), *given_options(sensor_choice)]
+    _report_next(inputs, weights, out, request.taxonomy, options)
 
 
 def _report_next(

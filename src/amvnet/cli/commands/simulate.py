@@ -27,9 +27,9 @@ def simulate(
 
     Args:
         out: folder to write to.
-        sensor: the LiDAR: hdl64e writes the layout of SemanticKITTI, hdl32e the layout of
-            nuScenes-lidarseg, and vlp16 (on a robot) a layout that robot.yaml in the folder
-            describes.
+        sensor: the LiDAR: hdl64e (in the layout of SemanticKITTI), hdl32e (in the layout of
+            nuScenes-lidarseg), or vlp16 (on a robot; robot.yaml in the folder describes the
+            layout).
         sequences: number of sequences; each is another street.
         scans: number of scans in each sequence.
         seed: the seed of all random numbers; the same seed gives the same bytes on the same kind of
@@ -42,7 +42,7 @@ def simulate(
     from amvnet.data.datasets.simulated import simulate as simulate_streets
     from amvnet.files import check_no_links
 
-    check_no_links(out)
+    check_no_links(out)  # because the simulator does not look
     with progress("simulating") as step:
         simulate_streets(
             out,

@@ -67,9 +67,9 @@ def _open(spec: str) -> Dataset:
     path, version = _split_version(rest if kind in READERS else spec)
     if not path.is_dir():
         if spec.lower().endswith(ENDINGS):
-            return open_own(spec)  # raises what it raises for files:SPEC
+            return open_own(spec)  # raises the error for a YAML file that does not exist
         raise InputError(
-            f"{path}: expected the folder of a dataset, found none{_or_description(path)}"
+            f"{path}: expected the folder of a dataset, found none{_did_you_mean_file(path)}"
         )
 
     reader = READERS[kind] if kind in READERS else _guess_reader(path)
@@ -86,12 +86,12 @@ def _is_own(spec: str) -> bool:
     return spec.partition(":")[0] == OWN or is_description(spec)
 
 
-def _or_description(path: Path, advice: str = "check the path") -> str:
-    """Return the end of a message: the YAML file that is meant by a name without its ending."""
+def _did_you_mean_file(path: Path, advice: str = "check the path") -> str:
+    """Return the end of a message: the YAML file of this name and an ending, or else the advice."""
     for ending in ENDINGS:
-        described = path.with_name(path.name + ending) if path.name else path
-        if is_description(str(described)):
-            return f"; did you mean {described}?"
+        file = f"{path}{ending}"
+        if is_description(file):
+            return f"; did you mean {file}?"
     return f"; {advice}"
 
 
@@ -115,7 +115,7 @@ def _guess_reader(path: Path) -> Reader:
     if readers:
         found = "both; write " + " or ".join(f"{kind}:PATH" for kind in READERS)
     else:
-        found = f"neither{_or_description(path, _advice_for(path))}"
+        found = f"neither{_did_you_mean_file(path, _advice_for(path))}"
     raise InputError(
         f"{path}: expected either sequences/XX/velodyne (SemanticKITTI) or v1.0-*/sample_data.json "
         f"(nuScenes), found {found}"
@@ -126,7 +126,7 @@ def _advice_for(path: Path) -> str:
     """Return what a user can do about a folder that has the layout of no dataset."""
     folder = path.absolute()
     for parent in folder.parents[:DEEPEST]:
-        # An unrelated folder next to this one may have the layout of a dataset.
+        # `matches` is not enough: a dataset in the parent may lie next to this unrelated folder.
         if any(reader.holds(parent, folder) for reader in READERS.values()):
             return f"give the folder of the whole dataset, {parent}"
     described = [file for file in sorted(path.iterdir()) if file.suffix.lower() in ENDINGS]

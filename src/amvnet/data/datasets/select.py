@@ -31,7 +31,8 @@ def to_train(
 def to_mix_in(dataset: Dataset) -> Source:
     """Return the labelled scans that can be mixed into those of another dataset.
 
-    They are the scans of the training split; without a split, all but those of test and val.
+    They are the scans of the dataset's own split train. If it has no split of its own, they are all
+    scans outside test and val.
 
     Raises:
         InputError: if there are none.
@@ -52,30 +53,22 @@ def to_mix_in(dataset: Dataset) -> Source:
 def named_sequences(
     dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """Return the sequences to train on and to validate with, as `to_train` does."""
+    """Return the sequences to train on and to validate with; `to_train` says what the arguments do.
+
+    Raises:
+        InputError: if no sequence is left for one of both, or one to train on is of the test split.
+    """
     # A sequence that the user named for one purpose is not used for the other by default.
     usual = dataset.division()
     trainable = usual["train"] if dataset.is_split else dataset.trainable()
     names_val = val or _without(usual["val"], train or ())
-    names_train = train or _without(trainable if val or with_val else usual["train"], names_val)
+    names_train = train or _without(trainable, names_val)
 
     if with_val:
         names_train = (*names_train, *_without(names_val, names_train))
         names_val = ()
     elif not names_train or not names_val:
-        if not (train or val or dataset.is_split) and len(trainable) < 2:
-            raise InputError(
-                f"{dataset.spec}: expected two sequences with labels, one to train on and one to "
-                f"validate with, found {' '.join(trainable) or 'none'} alone; add another one, or "
-                "divide it under split in a YAML file that describes the scans (docs/own_data.md)"
-            )
-        for split, named in (("val", val), ("train", train)):
-            if not named and not usual[split]:
-                raise InputError(dataset.lacks(split))
-        raise InputError(
-            f"{dataset.spec}: expected two sequences, one to train on and one to validate with, "
-            f"found {', '.join(dataset.splits()['all'])}; name them"
-        )
+        raise InputError(_too_few(dataset, train, val))
     of_test = sorted(set(names_train) & set(dataset.splits().get("test", ())))
     if of_test:
         raise InputError(
@@ -83,6 +76,25 @@ def named_sequences(
             f"{', '.join(of_test)}; name others, or correct the split"
         )
     return names_train, names_val
+
+
+def _too_few(dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None) -> str:
+    """Return the error that says why no sequence is left to train on or to validate with."""
+    trainable = dataset.trainable()
+    if not (train or val or dataset.is_split) and len(trainable) < 2:
+        return (
+            f"{dataset.spec}: expected two sequences with labels, one to train on and one to "
+            f"validate with, found {' '.join(trainable) or 'none'} alone; add another one, or "
+            "divide it under split in a YAML file that describes the scans (docs/own_data.md)"
+        )
+    usual = dataset.division()
+    for split, named in (("val", val), ("train", train)):
+        if not named and not usual[split]:
+            return dataset.lacks(split)
+    return (
+        f"{dataset.spec}: expected two sequences, one to train on and one to validate with, "
+        f"found {', '.join(dataset.splits()['all'])}; name them"
+    )
 
 
 def _without(names: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:

@@ -28,9 +28,9 @@ class PolarGrid:
         features: (S, 9) float32, the features of the S points that the networks see: offset from
             the voxel's centre (radius, angle, height), polar coordinates (radius, angle, height),
             x, y, intensity; metres and radians.
-        pillar: (P,) int64: each point's pillar, an index into the B * R * A pillars of the batch.
-        voxel: (P,) int64: each point's voxel within its pillar; 0 is the lowest.
-        occupied: (M,) int64: the pillars that hold points, ascending.
+        voxel: (P,) int64: the voxel of each of the P points within its pillar; 0 is the lowest.
+        occupied: (M,) int64: the pillars that hold points, ascending, as indices into the B * R * A
+            pillars of the batch.
         slot: (P,) int64: each point's pillar as an index into `occupied`.
         seen: (F,) int64: the pillars with points that the networks see, ascending.
         seen_slot: (S,) int64: the pillar of each point that the networks see, as an index into
@@ -39,7 +39,6 @@ class PolarGrid:
     """
 
     features: Tensor
-    pillar: Tensor
     voxel: Tensor
     occupied: Tensor
     slot: Tensor
@@ -56,8 +55,8 @@ class PolarGrid:
             return maximum
         return _pillar_maximum(features, self.seen_slot, len(self.seen))
 
-    def pool_by_parts(self, encode: Callable[[Tensor], Tensor], part: int) -> Tensor:
-        """Return `pool(encode(self.features))`, computed for `part` points at a time.
+    def pool_by_parts(self, encode: Callable[[Tensor], Tensor], part_size: int) -> Tensor:
+        """Return `pool(encode(self.features))`, computed for `part_size` points at a time.
 
         The points of a small part stay in a CPU's cache. Use this only without gradients.
         """
@@ -66,26 +65,28 @@ class PolarGrid:
             pooled = None
             for features, slot in share:
                 encoded = encode(features)
-                if pooled is None:
+                if pooled is None:  # -inf stays in pillars without a point of this share
                     pooled = encoded.new_full((len(self.seen), encoded.shape[1]), -torch.inf)
                 pooled.scatter_reduce_(0, slot[:, None].expand_as(encoded), encoded, "amax")
 
             assert pooled is not None
             return pooled
 
-        parts = list(zip(self.features.split(part), self.seen_slot.split(part), strict=True))
+        parts = list(
+            zip(self.features.split(part_size), self.seen_slot.split(part_size), strict=True)
+        )
         if not self.features.is_cpu:
             return pool_share(parts)
 
         # Every thread pools its share of the points.
-        size = math.ceil(len(parts) / torch.get_num_threads())
-        shares = [parts[start : start + size] for start in range(0, len(parts), size)]
+        share_size = math.ceil(len(parts) / torch.get_num_threads())
+        shares = [parts[first : first + share_size] for first in range(0, len(parts), share_size)]
         return functools.reduce(torch.maximum, run_parts(pool_share, shares))
 
-    def to_map(self, pillars: Tensor) -> Tensor:
+    def to_map(self, values: Tensor) -> Tensor:
         """Return the map (B, C, R, A) of the values (F, C) of the seen pillars; 0 elsewhere."""
         b, r, a, _ = self.shape
-        dense = pillars.new_zeros(b * r * a, pillars.shape[1]).index_copy(0, self.seen, pillars)
+        dense = values.new_zeros(b * r * a, values.shape[1]).index_copy(0, self.seen, values)
         return dense.view(b, r, a, -1).permute(0, 3, 1, 2)
 
     def at_pillars(self, maps: Tensor) -> Tensor:
@@ -185,6 +186,7 @@ class PolarView:
         intensity = batch.points[:, 3:]
         features = torch.cat([offset.T.to(xy.dtype), polar.T.to(xy.dtype), xy, intensity], dim=1)
 
+        # pillar = (scan * radial + radial_cell) * angular + angular_cell
         row = radial_cell.add(batch.scan, alpha=c.radial)
         pillar = angular_cell.add(row, alpha=c.angular)
         pillars = batch.count * c.radial * c.angular
@@ -199,7 +201,6 @@ class PolarView:
 
         return PolarGrid(
             features=features,
-            pillar=pillar,
             voxel=voxel,
             occupied=occupied,
             slot=slot,
