@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.recipes import load_recipe
@@ -73,6 +75,25 @@ def test_a_point_linear_layer_is_a_linear_layer(rows: int, sizes: tuple[int, int
     gradient = torch.autograd.grad(output.square().sum(), x)[0]
     expected_gradient = torch.autograd.grad(expected.square().sum(), x)[0]
     torch.testing.assert_close(gradient, expected_gradient)
+
+
+def test_a_drive_of_scans_needs_code_for_few_numbers_of_points() -> None:
+    """Each number of rows has code of its own in oneDNN, which the process keeps."""
+    counts = set()
+
+    class Counting(TorchDispatchMode):
+        def __torch_dispatch__(
+            self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+        ) -> Any:
+            if "linear" in str(func):
+                counts.add(len(args[0]))
+            return func(*args, **(kwargs or {}))
+
+    layer = PointLinear(4, 3)
+    with torch.inference_mode(), Counting():
+        sizes = [len(layer(torch.zeros(rows, 4))) for rows in range(0, 10_000, 100)]
+    assert sizes == list(range(0, 10_000, 100))
+    assert 0 < len(counts) < 10
 
 
 def test_a_batch_of_two_equals_each_alone_in_eval(case: Case) -> None:

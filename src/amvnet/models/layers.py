@@ -12,6 +12,10 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
 from amvnet.models.cpu_convolution import convolve, is_plain
 
+# oneDNN compiles code for each number of rows, and keeps the code for the last thousand. With
+# multiples of this number, scans share it.
+ROWS = 2048
+
 
 class RingConv2d(nn.Conv2d):
     """A convolution over maps whose last axis is the azimuth.
@@ -94,8 +98,9 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     needs_gradient = torch.is_grad_enabled() and (x.requires_grad or weight.requires_grad)
     if needs_gradient or not is_plain(x, weight) or not torch.backends.mkldnn.is_available():
         return F.linear(x, weight, bias)
-    outputs: Tensor = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
-    return outputs
+    padded = F.pad(x, (0, 0, 0, -len(x) % ROWS))
+    outputs: Tensor = torch.ops.mkldnn._linear_pointwise(padded, weight, bias, "none", [], "")
+    return outputs[: len(x)]
 
 
 class ConvBlock(nn.Sequential):
