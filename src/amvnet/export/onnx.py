@@ -20,7 +20,6 @@ from amvnet.errors import InputError, import_optional
 from amvnet.export.int8 import KEEPS_FIRST_LAYER, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, remove_notes
 from amvnet.files import atomic_write, publish, temporary_folder
-from amvnet.inference.segmentation import Verdict
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName, check_method, widest_method
 from amvnet.models.point_head import head_features, point_table
@@ -31,6 +30,7 @@ from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
 from amvnet.weights.file import Weights, load
+from amvnet.weights.verdict import Verdict
 
 GRAPH = Signature("an ONNX graph", rb"\x08.\x12.(pytorch|onnx)")
 DESCRIBED = Signature("a description of ONNX graphs", rb'\{\s*"format": ')
