@@ -22,10 +22,10 @@ from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.engines.export.onnx import describe_export, export
 from amvnet.errors import InputError
 from amvnet.evaluation.scoring import label_by_weights
-from amvnet.export.int8 import calibration_scans
-from amvnet.export.onnx import describe_export, export
+from amvnet.inference.calibration import calibration_scans
 from amvnet.inference.fuse import Fusion
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.reading import normalised

@@ -329,7 +329,7 @@ def load_segmenter(
     Raises:
         InputError: if `amvnet.load` cannot make the segmenter.
     """
-    from amvnet import load_with
+    from amvnet.inference.loading import load_with
     from amvnet.runtime.memory import keep_freed_memory
 
     segmenter = load_with(compute, weights, method, tau, report=report)
