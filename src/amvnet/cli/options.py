@@ -344,9 +344,9 @@ def join_processes(cuda: bool = False) -> Processes:
     Args:
         cuda: whether the processes compute on CUDA devices.
     """
-    from amvnet.runtime.distributed import join
+    from amvnet.runtime.distributed import connect
 
-    processes = join(cuda)
+    processes = connect(cuda)
     if not processes.first:
         silence()
     return processes

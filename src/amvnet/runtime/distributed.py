@@ -121,7 +121,7 @@ def _slurm_tasks() -> int:
 
 
 @functools.cache
-def join(cuda: bool = False) -> Processes:
+def connect(cuda: bool = False) -> Processes:
     """Connect to the other processes of this job, if there are any.
 
     Args:

@@ -24,7 +24,7 @@ from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.outputs import check_not_read
 from amvnet.training.expectation import NETWORK_OF
 from amvnet.training.plan import Plan
-from amvnet.weights.file import Weights, load
+from amvnet.weights.file import Weights, read
 from amvnet.weights.parts import SIZES, replace_part
 
 # The stages in order, and the part of the weights that each of them trains.
@@ -69,8 +69,9 @@ def check_folder(plan: Plan) -> None:
             input, or the folder is a dataset.
     """
     names = (RECIPE, WEIGHTS, COUNTS, CURVES, RECORD, *PART_OF)
+    is_begun = is_run(plan.out)
     check_not_read([plan.out / name for name in names], plan.also_read)
-    if is_run(plan.out):
+    if is_begun:
         return
     if is_dataset(str(plan.out)):
         raise InputError(
@@ -117,7 +118,7 @@ def with_trained(plan: Plan, name: str, weights: Weights) -> Weights:
     The recipe decides which of the two is kept.
     """
     path = plan.out / name / f"{plan.recipe.training.keep}.safetensors"
-    return replace_part(weights, PART_OF[name], load(path))
+    return replace_part(weights, PART_OF[name], read(path))
 
 
 def with_finished(plan: Plan, weights: Weights) -> Weights:

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from amvnet.config.nested import flat, to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
@@ -88,6 +89,17 @@ def fits(weights: Weights, part: str, model: ModelConfig) -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def differences(weights: Weights, part: str, model: ModelConfig) -> list[str]:
+    """Return in words the sizes of one part that differ in another configuration."""
+    others = dict(flat(to_dict(model), "model"))
+    found = []
+    for section in SIZES[part]:
+        for key, value in flat(to_dict(getattr(weights.model, section)), f"model.{section}"):
+            if value != others[key]:
+                found.append(f"{key} is {value}, not {others[key]}")
+    return found
 
 
 def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weights, list[str]]:

@@ -33,9 +33,8 @@ def rank(
     from amvnet.evaluation.label_errors import TABLE, write_clusters
     from amvnet.evaluation.label_errors import rank as rank_records
     from amvnet.files import make_folder
-    from amvnet.inference.reading import normalised
     from amvnet.outputs import check_outputs
-    from amvnet.sensors.normalise import Normaliser
+    from amvnet.sensors.normalise import Normaliser, normalised
     from amvnet.weights.file import load
 
     # Check this before any scan is scored, so that no time is wasted.
