@@ -9,13 +9,11 @@ import numpy as np
 from amvnet.data.check import check_scans
 from amvnet.data.datasets.base import Dataset
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
 from amvnet.progress import Progress, Tenths
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.expectation import expected_after
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import (
-    COUNTS,
     PART_OF,
     check_begun,
     stage_settings,
@@ -23,7 +21,7 @@ from amvnet.training.run_folder import (
     with_finished,
 )
 from amvnet.weights.file import Weights
-from amvnet.weights.parts import differences, fits, for_classes, replace_part
+from amvnet.weights.parts import differences, for_classes, head_fits, replace_part
 
 # A dataset teaches a class if more than this share of its labelled points have it. A few points may
 # have it by mistake.
@@ -85,7 +83,7 @@ def first_weights(plan: Plan) -> Weights:
         if part not in begun.parts or not (is_trained or has_classes):
             continue
         # A new kind of head can be trained on the networks of any weights.
-        if name == "head" and is_trained and not fits(begun, part, plan.recipe.model):
+        if name == "head" and is_trained and not head_fits(begun, plan.recipe.model):
             plan.report("head: new, because the head of the initial weights has other sizes")
             continue
         weights = replace_part(weights, part, begun)
@@ -163,10 +161,3 @@ def _progress(plan: Plan, dataset: Dataset) -> Progress:
             plan.report(f"{dataset.spec}: checked {min(done * size, every)} of {every} scans")
 
     return progress
-
-
-def keep_counts(plan: Plan, counts: np.ndarray) -> None:
-    """Write the (K,) counts of `check_data` into the folder of the run, for `weights.calibrate`."""
-    with atomic_write(plan.out / COUNTS) as part:
-        names = [record.name for record in plan.data.train]
-        np.savez(part, counts=counts, scans=names, classes=plan.data.taxonomy.classes)

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from amvnet.config.nested import flat, to_dict
@@ -69,9 +70,8 @@ def check_folder(plan: Plan) -> None:
             input, or the folder is a dataset.
     """
     names = (RECIPE, WEIGHTS, COUNTS, CURVES, RECORD, *PART_OF)
-    is_begun = is_run(plan.out)
     check_not_read([plan.out / name for name in names], plan.also_read)
-    if is_begun:
+    if is_run(plan.out):
         return
     if is_dataset(str(plan.out)):
         raise InputError(
@@ -162,6 +162,13 @@ def write_record(plan: Plan) -> None:
     if plan.recipe.from_init:
         del recipe["model"]
     write_yaml(plan.out / RECIPE, recipe)
+
+
+def keep_counts(plan: Plan, counts: np.ndarray) -> None:
+    """Write the (K,) counts of points by class into the folder, for `weights.calibrate`."""
+    with atomic_write(plan.out / COUNTS) as part:
+        names = [record.name for record in plan.data.train]
+        np.savez(part, counts=counts, scans=names, classes=plan.data.taxonomy.classes)
 
 
 def write_yaml(path: Path, tree: dict[str, Any]) -> None:
