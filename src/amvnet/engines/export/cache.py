@@ -10,6 +10,7 @@ import os
 import shutil
 import stat
 import uuid
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -56,27 +57,29 @@ def cached_networks(
     exported = "exported and calibrated in int8" if int8 else "exported"
     folder = user_cache() / "onnx" / _key(weights, int8)
     shared = shared_with_others(folder)
-    if shared is None:
-        with suppress(InputError):
-            return ExportedNetworks(_read(folder, weights), folder)
-
-    problem = None
     if shared is not None:
         problem = f"{shared}: expected a cache that no other user can write, found that others can"
-    elif not _can_write(folder.parent):
-        problem = f"{folder.parent}: expected a cache to write to, found a place that is read-only"
-    if problem is not None:
+    else:
+        with suppress(InputError):
+            return ExportedNetworks(_read(folder, weights), folder)
+        place = f"{folder.parent}: expected a cache to write to, found a place that is read-only"
+        problem = "" if _can_write(folder.parent) else place
+
+    if problem:
         report(
             f"{problem}; the networks are {exported} for this run alone; correct its owner and "
             f"mode, or set {CACHE} to a folder of yours"
         )
-        with temporary_folder() as temporary:
-            export(weights, temporary, scans=_calibration(weights, int8))
-            return ExportedNetworks(_read(temporary, weights))
+    else:
+        found = ", because files in the cache were missing or changed" if folder.exists() else ""
+        report(f"the networks are {exported}{found}, once for these weights, and kept in {folder}")
 
-    found = "" if not folder.exists() else ", because files in the cache were missing or changed"
-    report(f"the networks are {exported}{found}, once for these weights, and kept in {folder}")
-    return ExportedNetworks(_export(weights, int8, folder), folder)
+    scans = simulated_scans(weights) if int8 else []
+    if not problem:
+        return ExportedNetworks(_export(weights, scans, folder), folder)
+    with temporary_folder() as temporary:
+        export(weights, temporary, scans=scans)
+        return ExportedNetworks(_read(temporary, weights))
 
 
 def _key(weights: Weights, int8: bool) -> str:
@@ -108,13 +111,13 @@ def _can_write(folder: Path) -> bool:
         return False
 
 
-def _export(weights: Weights, int8: bool, folder: Path) -> dict[str, bytes]:
+def _export(weights: Weights, scans: Sequence[Scan], folder: Path) -> dict[str, bytes]:
     """Export into a folder of the cache, which appears whole; return the contents of the graphs."""
     part = folder.with_name(f".{uuid.uuid4().hex}.part")
     part.mkdir(PRIVATE_FOLDER)
     unfinished.add(part)
     try:
-        export(weights, part, scans=_calibration(weights, int8))
+        export(weights, part, scans=scans)
         for path in part.iterdir():
             path.chmod(PRIVATE_FILE)
         networks = _read(part, weights)
@@ -145,10 +148,6 @@ def _publish(part: Path, folder: Path, weights: Weights) -> None:
             shutil.rmtree(broken, ignore_errors=True)
         else:
             broken.unlink(missing_ok=True)
-
-
-def _calibration(weights: Weights, int8: bool) -> list[Scan]:
-    return simulated_scans(weights) if int8 else []
 
 
 def user_cache() -> Path:
