@@ -18,7 +18,7 @@ from amvnet import Scan
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.labels.ids import write_ids
-from amvnet.ranking.clusters import cluster
+from amvnet.evaluation.label_errors import cluster
 
 SHARE = 0.01  # the share of the things that get another class
 MIN_POINTS = 10  # the least number of points of a thing

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 
 from amvnet.engines import precision
 from amvnet.engines import torch as torch_engine
-from amvnet.export import onnx as onnx_export
+from amvnet.engines.export import onnx as onnx_export
 from amvnet.scan import Scan
 
 from fixtures.exports import converting_once

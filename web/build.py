@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from amvnet.data.palette import DRAWN, UNLABELLED
-from amvnet.export.onnx import export
+from amvnet.engines.export.onnx import export
 from amvnet.viewing.page import drawing, fill_page
 from lidarstreets import simulate
 
@@ -49,7 +49,7 @@ SAMPLE_SEED = 80
 SAMPLE_STREET = 7  # the training has no such street
 
 CACHE = ROOT / "build" / "try"  # keeps what takes a minute to make
-MADE_BY = ("config", "export", "models", "sensors", "weights")  # the packages that decide graphs
+MADE_BY = ("config", "engines", "models", "sensors", "weights")  # the packages that decide graphs
 
 
 def on_files(files: Any, config: Any) -> None:

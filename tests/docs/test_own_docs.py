@@ -15,9 +15,9 @@ import pytest
 
 from amvnet.data.formats.detect import ENDINGS
 from amvnet.data.formats.registry import PACKAGES
-from amvnet.inference.segmentation import Verdict
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import load, save
+from amvnet.weights.verdict import Verdict
 
 from fixtures.commands import files, succeed
 from fixtures.marks import with_quick

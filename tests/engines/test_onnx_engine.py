@@ -14,10 +14,10 @@ import torch
 
 import amvnet
 from amvnet.engines.base import WithUnet
+from amvnet.engines.export import cache as cache_module
+from amvnet.engines.export import int8
+from amvnet.engines.export.cache import cached_networks
 from amvnet.engines.onnx import OnnxEngine, OnnxGraph
-from amvnet.export import cache as cache_module
-from amvnet.export import int8
-from amvnet.export.cache import cached_networks
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.models.methods import MethodName
 from amvnet.weights.file import load
@@ -132,7 +132,7 @@ def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
     pytest.importorskip("embreex")
     monkeypatch.setattr(int8, "MAX_SCANS", 3)
     weights = load("sim-hdl64e")
-    scan = int8.calibration_scans("simulated", weights)[0]
+    scan = int8.simulated_scans(weights)[0]
 
     expected = amvnet.load(weights)(scan).labels
     said: list[str] = []
@@ -183,7 +183,7 @@ def test_other_engines_and_missing_libraries_are_one_line(
     fails(lambda: amvnet.load(WEIGHTS, engine=engine), "tensorrt", "onnx")
     fails(lambda: amvnet.load("sim-hdl64e", engine=engine), "tensorrt")
 
-    monkeypatch.setattr("amvnet.export.onnx.LIBRARIES", ("no_such_library",))
+    monkeypatch.setattr("amvnet.engines.export.onnx.LIBRARIES", ("no_such_library",))
     fails(lambda: amvnet.load(WEIGHTS, engine="onnx"), "no_such_library", "amvnet[export]")
 
 

@@ -22,13 +22,12 @@ from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.engines.export.onnx import describe_export, export
 from amvnet.errors import InputError
 from amvnet.evaluation.scoring import label_by_weights
-from amvnet.export.int8 import calibration_scans
-from amvnet.export.onnx import describe_export, export
+from amvnet.inference.calibration import calibration_scans
 from amvnet.inference.fuse import Fusion
 from amvnet.inference.listing import list_inputs
-from amvnet.inference.reading import normalised
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import LateFusion
 from amvnet.models.views.points import PointBatch
@@ -39,7 +38,7 @@ from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.laser_order import lasers_by_order
 from amvnet.sensors.lidars import Sensor
-from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.normalise import Normaliser, normalised
 from amvnet.training.loaders import ScanSet, collate
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import save

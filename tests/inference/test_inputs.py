@@ -18,12 +18,12 @@ from amvnet.data.formats import find
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
-from amvnet.inference import reading
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.predict import ADVICE, report_certainty
 from amvnet.inference.reading import array_scan
 from amvnet.scan import Scan
+from amvnet.sensors import normalise
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.measure import MEASURED_SCANS
@@ -110,7 +110,7 @@ def test_a_sensor_in_the_yaml_file_counts_unless_the_command_describes_one(tmp_p
     path.write_text('classes: {a: 1, b: 2}\nscans: "scans/*"\nsensor: {height: 1.5}\n')
 
     for described, expected in ((None, 1.5), (Sensor(height=2.0), 2.0)):
-        dataset = reading.normalised(
+        dataset = normalise.normalised(
             open_dataset(str(path)), Normaliser(weights_for().expects, described)
         )
         assert isinstance(dataset, OwnScans)

@@ -17,11 +17,11 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.errors import InputError
 from amvnet.evaluation.analysis import analyze
+from amvnet.evaluation.label_errors import rank
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmenter import Segmenter
-from amvnet.ranking.label_errors import rank
 from amvnet.runtime.memory import available_memory
 from amvnet.viewing.shown_scans import show_scans
 

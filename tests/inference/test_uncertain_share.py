@@ -12,8 +12,8 @@ import pytest
 
 import amvnet
 from amvnet.inference.predict import ADVICE
-from amvnet.inference.segmentation import Verdict
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
+from amvnet.weights.verdict import Verdict
 
 from fixtures.commands import run_cli
 from fixtures.tiny import fresh_weights, street, without

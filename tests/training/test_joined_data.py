@@ -22,12 +22,11 @@ from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.reading import normalised
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.lidars import Sensor
-from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.normalise import Normaliser, normalised
 from amvnet.training import checking
 from amvnet.training.augment import mix
 from amvnet.training.checking import check_data

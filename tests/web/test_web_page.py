@@ -24,11 +24,11 @@ import pytest
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
-from amvnet.export.onnx import export
-from amvnet.inference.segmentation import Verdict
+from amvnet.engines.export.onnx import export
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import load, save
+from amvnet.weights.verdict import Verdict
 
 from fixtures.browser_pages import CHROMIUM, FLAGS
 from fixtures.pages import load_script

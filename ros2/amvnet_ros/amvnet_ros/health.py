@@ -140,7 +140,7 @@ def _judge(period: _Period, usual_uncertain: float) -> tuple[Level, str]:
     uncertain = _uncertain(period)
     if uncertain is not None:
         # Imported late: the node sets the environment before torch reads it.
-        from amvnet.inference.segmentation import Verdict
+        from amvnet.weights.verdict import Verdict
 
         verdict = Verdict(uncertain, usual_uncertain)
         if verdict.is_doubtful:

@@ -6,9 +6,9 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Any
 
-from amvnet import __version__
 from amvnet.cli.commands.ablate import ablate
 from amvnet.cli.commands.adapt import adapt
 from amvnet.cli.commands.analyze import analyze
@@ -80,7 +80,8 @@ def _usage() -> str:
     lines = ["usage: amvnet COMMAND ...", ""]
     for command, function in COMMANDS.items():
         lines.append(f"  {command:<10} {first_line(function)}")
-    return "\n".join([*lines, "", f"`amvnet COMMAND --help` says more. Version {__version__}."])
+    more = f"`amvnet COMMAND --help` says more. Version {version('amvnet')}."
+    return "\n".join([*lines, "", more])
 
 
 def _line_when_stopped(arguments: Sequence[str]) -> str:
@@ -99,7 +100,7 @@ def _run_and_explain(arguments: Sequence[str]) -> int:
         report_lines(_usage())
         return DONE if arguments else WRONG_INPUT
     if arguments[0] == "--version":
-        report(__version__)
+        report(version("amvnet"))
         return DONE
 
     try:

@@ -331,7 +331,7 @@ def load_segmenter(
     Raises:
         InputError: if `amvnet.load` cannot make the segmenter.
     """
-    from amvnet import load_with
+    from amvnet.inference.loading import load_with
     from amvnet.runtime.memory import keep_freed_memory
 
     segmenter = load_with(compute, weights, method, tau, report=report)
@@ -346,9 +346,9 @@ def join_processes(cuda: bool = False) -> Processes:
     Args:
         cuda: whether the processes compute on CUDA devices.
     """
-    from amvnet.runtime.distributed import join
+    from amvnet.runtime.distributed import connect
 
-    processes = join(cuda)
+    processes = connect(cuda)
     if not processes.first:
         silence()
     return processes

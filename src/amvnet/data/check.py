@@ -29,6 +29,7 @@ from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import check_trainable
 
 SHOWN_IDS = 5  # largest number of unknown ids that a message lists
+SHOWN_SCANS = 3  # largest number of broken scans that a message names
 
 
 @dataclass(frozen=True)
@@ -191,6 +192,24 @@ class Report:
                     f"{self.spec}: expected points of two or more classes to train on, found only "
                     f"{present[0]}; label other classes, or name other scans"
                 )
+
+    def require_trainable(self) -> None:
+        """Raise InputError if there is an error, or a scan is broken."""
+        for error in self.errors():
+            raise InputError(error)
+
+        broken = self.broken
+        if broken:
+            total = sum(len(split.scans) + len(split.broken) for split in self.splits.values())
+            others = list(broken)[1:SHOWN_SCANS]
+            more = len(broken) - 1 - len(others)
+            rest = f", also {', '.join(others)}" if others else ""
+            rest += f" and {more} more" if more > 0 else ""
+            raise InputError(
+                f"{self.spec}: expected scans that can be read, found {len(broken)} of "
+                f"{counted(total, 'scan')} that cannot: {next(iter(broken.values()))}{rest}; "
+                "correct them or leave them out (amvnet check lists all)"
+            )
 
     def warnings(self) -> Iterator[str]:
         """Yield a line for each thing that may be a mistake."""

@@ -1,1 +1,1 @@
-"""The official metrics, the paper's figures and drawings from above."""
+"""The official metrics and archives, labels that look wrong, and the paper's figures."""

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from amvnet import load_with
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import BAGS, FOLDER, ending_of
 from amvnet.data.formats.find import NamedScan
@@ -33,6 +32,7 @@ from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, 
 from amvnet.fleet.secrets import without_secrets
 from amvnet.fleet.storage import Place
 from amvnet.inference.listing import FileReader, FileScan, Outcome
+from amvnet.inference.loading import load_with
 from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest

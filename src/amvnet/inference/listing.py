@@ -25,10 +25,9 @@ from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
-from amvnet.inference.reading import normalised
 from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
-from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.normalise import Normaliser, normalised
 
 
 @dataclass(frozen=True)

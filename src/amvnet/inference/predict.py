@@ -12,11 +12,12 @@ from amvnet.inference.journal import Entry
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_output
 from amvnet.inference.request import LabellingRequest
-from amvnet.inference.segmentation import Segmentation, Verdict
+from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Normaliser
+from amvnet.weights.verdict import Verdict
 
 SHOWN_RECORDINGS = 10  # the most doubtful recordings that are named, each in a line
 # What a user can try if the labels are doubtful.

@@ -1,4 +1,4 @@
-"""Read arrays, scan files and a user's own datasets, normalised to what some weights expect."""
+"""Read arrays of points as scans."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset
 from amvnet.data.formats.cloud import Cloud, require_columns
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
 from amvnet.sensors.frame import check_metres
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler
-from amvnet.sensors.lidars import Sensor, make_sensor
-from amvnet.sensors.normalise import Normaliser
 
 # Largest number of columns of an array of points; an array with more columns is taken for a
 # transposed one.
@@ -105,35 +102,3 @@ def _check_shape(array: np.ndarray) -> None:
     if array.ndim == 3:
         advice += ", or give several scans to Segmenter.many"
     raise InputError(f"scan: expected {EXPECTED}, found {array.shape}; {advice}")
-
-
-def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
-    """Return a dataset whose scans are normalised as scan files are.
-
-    Only a user's own scans are changed: the scans of the benchmarks stay unchanged, because weights
-    are trained on such scans.
-
-    Args:
-        normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML
-            file says of it counts.
-
-    Raises:
-        InputError: if the YAML file describes an impossible sensor.
-    """
-    if dataset.described_sensor is not None and normaliser.sensor == Sensor():
-        normaliser = normaliser.for_sensor(described_sensor(dataset))
-
-    for source, scans in dataset.recordings().items():
-        for scan in scans:
-            normaliser.expect(source, scan.read)
-    return dataset.normalised_by(normaliser)
-
-
-def described_sensor(dataset: Dataset) -> Sensor:
-    """Return what a dataset's YAML file says of the sensor.
-
-    Raises:
-        InputError: if there is no such sensor.
-    """
-    with errors_of(f"{dataset.spec}: sensor"):
-        return make_sensor(dataset.described_sensor)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -20,72 +19,10 @@ from amvnet.models.amvnet import Scores
 from amvnet.models.methods import METHODS
 from amvnet.outputs import check_outputs
 from amvnet.scan import Scan
+from amvnet.weights.verdict import Verdict
 
 SHOWN_CLASSES = 3  # largest number of classes that the short description of a result names
-
-# The ratio of the odds of an uncertain point to the usual odds, above which labels are doubtful.
-# A ratio of odds suits every tau, a difference of shares does not. With the built-in weights and
-# their tau of 0.85, real scans of the right sensor have a ratio of up to 4; scans in another frame
-# or unit mostly have a larger one (docs/log.md).
-UNUSUAL_ODDS = 4.0
-# The share of uncertain points below which labels are not doubtful, whatever the usual share is.
-# Networks that hardly ever disagree have a usual share near 0.
-FEW_UNCERTAIN = 0.01
-# The mean entropy of a network that the built-in weights have on real scans of their sensor, by its
-# part of the weights, and the ratio of its odds above which labels are doubtful. In another frame,
-# the range view has 0.57 to 0.66 and the bird's-eye view 0.24 to 0.37 (docs/log.md).
-USUAL_ENTROPY = {"range_net": 0.25, "polar_net": 0.155}
-UNUSUAL_ENTROPY_ODDS = 1.6
 SMALLEST = 1e-12  # probability whose logarithm stands for that of 0
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The verdict on how sure the labels of some scans are; it prints as one line.
-
-    Attributes:
-        share: the share of the points that are uncertain, in [0, 1] (`Segmentation.doubt`).
-        usual: this share in the scans that the weights were validated on, in [0, 1]; None if it is
-            not known, for example because tau is another one.
-    """
-
-    share: float
-    usual: float | None
-    unusual_odds: ClassVar[float] = UNUSUAL_ODDS
-    quantity: ClassVar[str] = "of the points are uncertain"
-
-    @classmethod
-    def of(cls, method: str, share: float, usual_uncertain: float | None) -> Verdict:
-        """Return the verdict on a method's labels, given their `doubt` and its usual value."""
-        if METHODS[method].has_two_networks:
-            return Verdict(share, usual_uncertain)
-        return EntropyVerdict(share, USUAL_ENTROPY[METHODS[method].parts[0]])
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether so many points are uncertain that the weights hardly know such scans.
-
-        False if the usual share is not known, or few points are uncertain.
-        """
-        if self.usual is None or self.share < FEW_UNCERTAIN:
-            return False
-        return self.share * (1 - self.usual) > (self.unusual_odds * self.usual * (1 - self.share))
-
-    @property
-    def shares(self) -> str:
-        """Both shares as text, in percent."""
-        text = f"{self.share:.1%} {self.quantity}"
-        return text if self.usual is None else f"{text} (usual: {self.usual:.1%})"
-
-    def __str__(self) -> str:
-        return f"do not rely on these labels: {self.shares}" if self.is_doubtful else self.shares
-
-
-class EntropyVerdict(Verdict):
-    """The verdict on the labels of a single network, whose shares are mean entropies."""
-
-    unusual_odds = UNUSUAL_ENTROPY_ODDS
-    quantity = "is the mean entropy of the network"
 
 
 @dataclass(frozen=True)

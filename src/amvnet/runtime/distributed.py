@@ -119,7 +119,7 @@ def _slurm_tasks() -> int:
 
 
 @functools.cache
-def join(cuda: bool = False) -> Processes:
+def connect(cuda: bool = False) -> Processes:
     """Connect to the other processes of this job, if any; by NCCL with CUDA, else by gloo."""
     if started() == 1:
         return ALONE

@@ -145,6 +145,13 @@ def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
     return np.quantile(ascending, PROBABILITIES)
 
 
+def mean_quantiles(scans: Sequence[Scan]) -> tuple[float, ...]:
+    """Return the mean quantiles of the intensities of some scans; empty if no scan has any."""
+    quantiles = [quantiles_of(scan.points[scan.valid, 3]) for scan in scans]
+    known = [values for values in quantiles if values is not None]
+    return tuple(np.mean(known, axis=0).round(4).tolist()) if known else ()
+
+
 def is_constant(quantiles: np.ndarray | Sequence[float]) -> bool:
     """Return whether nearly all intensities are equal, so that they say nothing."""
     low = quantiles[PROBABILITIES.index(0.01)]

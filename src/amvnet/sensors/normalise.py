@@ -8,8 +8,9 @@ from collections.abc import Callable
 import numpy as np
 
 from amvnet.config.schema import RangeViewConfig
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.formats.cloud import Cloud, usual_scale
-from amvnet.errors import InputError
+from amvnet.errors import InputError, errors_of
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import Reporter, report_nothing
@@ -19,7 +20,13 @@ from amvnet.sensors.frame import MAX_SENSOR_HEIGHT, Frame
 from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
 from amvnet.sensors.laser_order import lasers_by_order
 from amvnet.sensors.lasers import SensorGeometry, elevations
-from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, Sensor, rotation_from_degrees
+from amvnet.sensors.lidars import (
+    BUILT_IN,
+    KNOWN_SENSORS,
+    Sensor,
+    make_sensor,
+    rotation_from_degrees,
+)
 from amvnet.sensors.measure import (
     MEASURED_SCANS,
     Estimate,
@@ -235,6 +242,38 @@ class Normaliser:
             assumed = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
             self._report(f"{cloud.name}: assumed {', '.join(filter(None, assumed))}")
         return scan
+
+
+def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
+    """Return a dataset whose scans are normalised as scan files are.
+
+    Only a user's own scans are changed: the scans of the benchmarks stay unchanged, because weights
+    are trained on such scans.
+
+    Args:
+        normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML
+            file says of it counts.
+
+    Raises:
+        InputError: if the YAML file describes an impossible sensor.
+    """
+    if dataset.described_sensor is not None and normaliser.sensor == Sensor():
+        normaliser = normaliser.for_sensor(described_sensor(dataset))
+
+    for source, scans in dataset.recordings().items():
+        for scan in scans:
+            normaliser.expect(source, scan.read)
+    return dataset.normalised_by(normaliser)
+
+
+def described_sensor(dataset: Dataset) -> Sensor:
+    """Return what a dataset's YAML file says of the sensor.
+
+    Raises:
+        InputError: if there is no such sensor.
+    """
+    with errors_of(f"{dataset.spec}: sensor"):
+        return make_sensor(dataset.described_sensor)
 
 
 def _intensity_map(

@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from amvnet import load
 from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.engines.precision import choose_device
 from amvnet.evaluation.analysis import SweptRow, swept_row
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
+from amvnet.inference.loading import load
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.training.plan import Plan
 from amvnet.training.run import train

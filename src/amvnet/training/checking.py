@@ -6,17 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amvnet.config.nested import flat, to_dict
-from amvnet.data.check import Report, check_scans
+from amvnet.data.check import check_scans
 from amvnet.data.datasets.base import Dataset
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
-from amvnet.progress import Progress, Tenths, counted
+from amvnet.progress import Progress, Tenths
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.expectation import expected_after
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import (
-    COUNTS,
     PART_OF,
     check_begun,
     stage_settings,
@@ -24,9 +21,8 @@ from amvnet.training.run_folder import (
     with_finished,
 )
 from amvnet.weights.file import Weights
-from amvnet.weights.parts import SIZES, fits, for_classes, replace_part
+from amvnet.weights.parts import differences, for_classes, head_fits, replace_part
 
-SHOWN_SCANS = 3  # largest number of broken scans that a message names
 # A dataset teaches a class if more than this share of its labelled points have it. A few points may
 # have it by mistake.
 STRAY_SHARE = 1e-5
@@ -75,50 +71,33 @@ def first_weights(plan: Plan) -> Weights:
     If `init` has other classes, its parts are only taken for the stages to train.
     """
     sensor = plan.recipe.sensor
-    expects = Expectation.of_sensor(sensor)
-    weights = Weights(plan.recipe.model, plan.data.taxonomy, sensor, expects)
-    init = plan.init
+    taxonomy = plan.data.taxonomy
+    weights = Weights(plan.recipe.model, taxonomy, sensor, Expectation.of_sensor(sensor))
+    init = plan.init or weights
+    has_classes = init.taxonomy.classes == taxonomy.classes
+    seed = plan.recipe.training.seed
+    begun, new = (init, []) if has_classes else for_classes(init, taxonomy, seed)
     for name in stages_of_folder(plan):
         part = PART_OF[name]
-        if init is None or part not in init.parts:
+        is_trained = name in plan.stages
+        if part not in begun.parts or not (is_trained or has_classes):
             continue
         # A new kind of head can be trained on the networks of any weights.
-        is_trained = name in plan.stages
-        if name == "head" and is_trained and not fits(init, part, plan.recipe.model):
+        if name == "head" and is_trained and not head_fits(begun, plan.recipe.model):
             plan.report("head: new, because the head of the initial weights has other sizes")
             continue
-        if init.taxonomy.classes == weights.taxonomy.classes:
-            weights = replace_part(weights, part, init)
-            if not is_trained:
-                _report_kept(plan, init, part)
-        elif is_trained:
-            weights = replace_part(weights, part, _for_classes(plan, init, part))
-
+        weights = replace_part(weights, part, begun)
+        if not is_trained:
+            kept = differences(init, part, plan.recipe.model)
+            if kept:
+                plan.report(f"{part}: is not trained, so it stays as in --init: {'; '.join(kept)}")
+        elif not has_classes:
+            of_part = ", ".join(key for key in new if key.startswith(f"{part}."))
+            plan.report(
+                f"{part}: the initial weights ({init.taxonomy.name}), with new layers for the "
+                f"classes of {taxonomy.name}: {of_part}"
+            )
     return with_finished(plan, weights)
-
-
-def _report_kept(plan: Plan, init: Weights, part: str) -> None:
-    """Report the settings of a part that is not trained, if the recipe has others."""
-    of_recipe = dict(flat(to_dict(plan.recipe.model), "model"))
-    kept = []
-    for section in SIZES[part]:
-        for key, value in flat(to_dict(getattr(init.model, section)), f"model.{section}"):
-            if value != of_recipe[key]:
-                kept.append(f"{key} is {value}, not {of_recipe[key]}")
-    if kept:
-        plan.report(f"{part}: is not trained, so it stays as in --init: {'; '.join(kept)}")
-
-
-def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
-    """Return the initial weights with new last layers for the classes of the dataset."""
-    taxonomy = plan.data.taxonomy
-    weights, new = for_classes(init, taxonomy, plan.recipe.training.seed)
-    of_part = [name for name in new if name.startswith(f"{part}.")]
-    plan.report(
-        f"{part}: the initial weights ({init.taxonomy.name}), with new layers for the classes of "
-        f"{taxonomy.name}: {', '.join(of_part)}"
-    )
-    return weights
 
 
 def _check_initial(plan: Plan, name: str) -> None:
@@ -156,8 +135,9 @@ def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
         in_epoch = plan.data.in_epoch(number)
         train = in_epoch if dataset.simulated_sensor else source.train
         splits = {"train": train, "val": source.val}
-        checked = check_scans(dataset, splits, _progress(plan, dataset), plan.processes)
-        _refuse(checked)
+        progress = _progress(plan, dataset)
+        checked = check_scans(dataset, splits, progress, plan.processes)
+        checked.require_trainable()
         totals += checked.count_points(in_epoch)
         if dataset.simulated_sensor:
             taught.append(np.ones(len(totals) - 1, dtype=bool))
@@ -181,29 +161,3 @@ def _progress(plan: Plan, dataset: Dataset) -> Progress:
             plan.report(f"{dataset.spec}: checked {min(done * size, every)} of {every} scans")
 
     return progress
-
-
-def keep_counts(plan: Plan, counts: np.ndarray) -> None:
-    """Write the (K,) counts of `check_data` into the folder of the run, for `weights.calibrate`."""
-    with atomic_write(plan.out / COUNTS) as part:
-        names = [record.name for record in plan.data.train]
-        np.savez(part, counts=counts, scans=names, classes=plan.data.taxonomy.classes)
-
-
-def _refuse(checked: Report) -> None:
-    """Raise InputError if the check has found an error."""
-    for error in checked.errors():
-        raise InputError(error)
-
-    broken = checked.broken
-    if broken:
-        total = sum(len(split.scans) + len(split.broken) for split in checked.splits.values())
-        others = list(broken)[1:SHOWN_SCANS]
-        more = len(broken) - 1 - len(others)
-        rest = f", also {', '.join(others)}" if others else ""
-        rest += f" and {more} more" if more > 0 else ""
-        raise InputError(
-            f"{checked.spec}: expected scans that can be read, found {len(broken)} of "
-            f"{counted(total, 'scan')} that cannot: {next(iter(broken.values()))}{rest}; correct "
-            "them or leave them out (amvnet check lists all)"
-        )

@@ -6,8 +6,6 @@ import dataclasses
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 
-import numpy as np
-
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.training_data import TrainingData
 from amvnet.data.spacing import evenly_spaced
@@ -19,7 +17,7 @@ from amvnet.sensors.intensity import (
     SIMULATED_QUANTILES,
     TrainedIntensity,
     are_quantiles,
-    quantiles_of,
+    mean_quantiles,
 )
 from amvnet.sensors.lasers import measure_sensor
 from amvnet.sensors.normalise import Normaliser
@@ -73,7 +71,7 @@ def expected_after(
         simulated = SIMULATED_QUANTILES[first.simulated_sensor]
         intensity = TrainedIntensity(simulated, is_optional, is_matched=True)
     elif intensity is None or (as_is and not intensity.is_matched):
-        quantiles = _mean_quantiles(sampled)
+        quantiles = mean_quantiles(sampled)
         if quantiles == NO_INTENSITY or are_quantiles(quantiles):
             intensity = TrainedIntensity(quantiles, is_optional)
 
@@ -94,10 +92,3 @@ def _sample(data: TrainingData) -> list[Scan]:
         with suppress(InputError):
             sample.append(data.read(index, labels=False))
     return sample
-
-
-def _mean_quantiles(scans: Sequence[Scan]) -> tuple[float, ...]:
-    """Return the mean quantiles of the intensities of some scans; empty if no scan has any."""
-    quantiles = [quantiles_of(scan.points[scan.valid, 3]) for scan in scans]
-    known = [values for values in quantiles if values is not None]
-    return tuple(np.mean(known, axis=0).round(4).tolist()) if known else ()

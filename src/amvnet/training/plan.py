@@ -16,15 +16,14 @@ from amvnet.data.datasets.select import to_mix_in
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, describe_difference
 from amvnet.errors import InputError
-from amvnet.inference.reading import normalised
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Reporter, counted, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.sensors.expectation import Expectation
-from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.normalise import Normaliser, normalised
 from amvnet.training.expectation import NETWORK_OF, expected_before
-from amvnet.weights.file import Weights, load
+from amvnet.weights.file import Weights, read
 
 MAX_MEASURED_RECORDINGS = 20  # largest number of a user's recordings that are measured
 
@@ -255,4 +254,4 @@ def _earlier(out: Path) -> list[Weights]:
     whole = out / "weights.safetensors"
     if not paths and whole.is_file():  # the networks of --init
         paths = [whole]
-    return [load(path) for path in paths]
+    return [read(path) for path in paths]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import lightning as L
 
-from amvnet.training.checking import Checked, check, keep_counts
+from amvnet.training.checking import Checked, check
 from amvnet.training.curves import draw_curves, read_curves
 from amvnet.training.head import train_head
 from amvnet.training.networks import train_network
@@ -20,6 +20,7 @@ from amvnet.training.run_folder import (
     alone_in_run,
     check_folder,
     is_finished,
+    keep_counts,
     with_finished,
     with_trained,
     write_record,

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from amvnet.config.nested import flat, to_dict
@@ -24,7 +25,7 @@ from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.outputs import check_not_read
 from amvnet.training.expectation import NETWORK_OF
 from amvnet.training.plan import Plan
-from amvnet.weights.file import Weights, load
+from amvnet.weights.file import Weights, read
 from amvnet.weights.parts import SIZES, replace_part
 
 # The stages in order, and the part of the weights that each of them trains.
@@ -117,7 +118,7 @@ def with_trained(plan: Plan, name: str, weights: Weights) -> Weights:
     The recipe decides which of the two is kept.
     """
     path = plan.out / name / f"{plan.recipe.training.keep}.safetensors"
-    return replace_part(weights, PART_OF[name], load(path))
+    return replace_part(weights, PART_OF[name], read(path))
 
 
 def with_finished(plan: Plan, weights: Weights) -> Weights:
@@ -161,6 +162,13 @@ def write_record(plan: Plan) -> None:
     if plan.recipe.from_init:
         del recipe["model"]
     write_yaml(plan.out / RECIPE, recipe)
+
+
+def keep_counts(plan: Plan, counts: np.ndarray) -> None:
+    """Write the (K,) counts of points by class into the folder, for `weights.calibrate`."""
+    with atomic_write(plan.out / COUNTS) as part:
+        names = [record.name for record in plan.data.train]
+        np.savez(part, counts=counts, scans=names, classes=plan.data.taxonomy.classes)
 
 
 def write_yaml(path: Path, tree: dict[str, Any]) -> None:

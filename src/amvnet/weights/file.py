@@ -236,11 +236,21 @@ def load(name_or_path: str | Path) -> Weights:
         InputError: if there is no such file or name, the file does not hold AMVNet weights, a value
             of its description is out of its range, or its parameters do not fit the description.
     """
-    path = _find(str(name_or_path))
+    return read(_find(str(name_or_path)))
+
+
+def read(path: Path) -> Weights:
+    """Read a weights file, as `load` does.
+
+    Raises:
+        InputError: as `load`.
+    """
     try:
         with safe_open(path, "pt") as file:
             weights = _from_description((file.metadata() or {}).get(KEY, ""))
             tensors = _read_tensors(file, weights)
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a weights file, found none; train it again") from None
     except (SafetensorError, OSError):
         raise InputError(
             f"{path}: expected AMVNet weights in safetensors, found a truncated or another file of "

@@ -8,10 +8,12 @@ from typing import Any
 
 import torch
 
+from amvnet.config.nested import flat, to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
+from amvnet.models.point_head import PointHead
 from amvnet.weights.file import Weights
 
 # The fields of `ModelConfig` that set the sizes of each part.
@@ -69,15 +71,26 @@ def resized(weights: Weights, part: str, model: ModelConfig) -> Weights:
     return dataclasses.replace(weights, model=dataclasses.replace(weights.model, **sizes))
 
 
-def fits(weights: Weights, part: str, model: ModelConfig) -> bool:
-    """Return whether the parameters of one part have the sizes of another configuration."""
+def head_fits(weights: Weights, model: ModelConfig) -> bool:
+    """Return whether the parameters of the head have the sizes of another configuration."""
     with torch.device("meta"):  # takes no memory
-        module = getattr(build_amvnet(model, weights.taxonomy.size), part)
+        head = PointHead(model.point_head, weights.taxonomy.size)
     try:
-        module.load_state_dict(weights.part(part), assign=True)
+        head.load_state_dict(weights.part("point_head"), assign=True)
     except RuntimeError:
         return False
     return True
+
+
+def differences(weights: Weights, part: str, model: ModelConfig) -> list[str]:
+    """Return in words the sizes of one part that differ in another configuration."""
+    others = dict(flat(to_dict(model), "model"))
+    found = []
+    for section in SIZES[part]:
+        for key, value in flat(to_dict(getattr(weights.model, section)), f"model.{section}"):
+            if value != others[key]:
+                found.append(f"{key} is {value}, not {others[key]}")
+    return found
 
 
 def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weights, list[str]]:

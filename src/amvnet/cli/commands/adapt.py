@@ -110,8 +110,7 @@ def _score_on(
     """Return a function that returns the mIoU of a segmenter on labelled scans, in [0, 1]."""
     from amvnet.data.datasets.open import open_dataset
     from amvnet.evaluation.scoring import evaluate, label_by_weights
-    from amvnet.inference.reading import normalised
-    from amvnet.sensors.normalise import Normaliser
+    from amvnet.sensors.normalise import Normaliser, normalised
 
     dataset = normalised(open_dataset(val, weights.taxonomy), Normaliser(weights.expects))
     records = LabelledChoice("all", sequences).records(dataset)

@@ -53,9 +53,8 @@ def analyze(
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
-    from amvnet.inference.reading import normalised
     from amvnet.outputs import check_outputs
-    from amvnet.sensors.normalise import Normaliser
+    from amvnet.sensors.normalise import Normaliser, normalised
     from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
     from amvnet.training.plan import Plan
     from amvnet.weights.file import load

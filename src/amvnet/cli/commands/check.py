@@ -24,7 +24,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
         choice: which scans to check in addition to the labelled scans of the test split.
     """
     from amvnet.data.datasets.open import open_dataset
-    from amvnet.inference.reading import described_sensor
+    from amvnet.sensors.normalise import described_sensor
 
     dataset = open_dataset(data)
     described_sensor(dataset)  # raises if there is no such sensor

@@ -29,12 +29,12 @@ def demo(
         weights: a weights file, or the name of built-in weights.
         overwrite: replace the page and the scores if they exist.
     """
-    from amvnet import load
     from amvnet.data.datasets.simulated import simulate
     from amvnet.data.taxonomy import CLASSES_BY_SENSOR
     from amvnet.errors import InputError
     from amvnet.evaluation.metrics import REPORT
     from amvnet.inference.listing import list_inputs
+    from amvnet.inference.loading import load
     from amvnet.outputs import check_outputs
     from amvnet.viewing.page import PAGE, write_page
     from amvnet.viewing.shown_scans import show_scans

@@ -64,9 +64,8 @@ def evaluate(
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files, pictures_of
     from amvnet.files import make_folder
-    from amvnet.inference.reading import normalised
     from amvnet.outputs import check_outputs
-    from amvnet.sensors.normalise import Normaliser
+    from amvnet.sensors.normalise import Normaliser, normalised
     from amvnet.weights.file import load
 
     def check_files(records: Sequence[ScanRecord]) -> None:

@@ -17,13 +17,18 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
             or a folder of them as predict takes them, or the word simulated; default: float32.
         overwrite: replace files that exist.
     """
-    from amvnet.export.onnx import export as export_weights
-    from amvnet.export.onnx import possible_files
+    from amvnet.engines.export.onnx import check_libraries, possible_files
+    from amvnet.engines.export.onnx import export as export_weights
+    from amvnet.inference.calibration import calibration_scans
     from amvnet.outputs import check_outputs
+    from amvnet.weights.file import load
 
     check_outputs(possible_files(out), [weights, int8], overwrite)
+    check_libraries()
+    loaded = load(weights)
+    scans = [] if int8 is None else calibration_scans(int8, loaded)
     with progress("exporting") as step:
-        graphs = export_weights(weights, out, step, int8)
+        graphs = export_weights(loaded, out, step, scans)
     report(f"{len(graphs)} graphs and amvnet.json in {out}")
     differences = [graph["difference"] for graph in graphs.values() if "difference" in graph]
     if differences:

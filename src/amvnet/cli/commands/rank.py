@@ -30,12 +30,11 @@ def rank(
         overwrite: replace the table if it exists.
     """
     from amvnet.data.datasets.open import open_dataset
+    from amvnet.evaluation.label_errors import TABLE, write_clusters
+    from amvnet.evaluation.label_errors import rank as rank_records
     from amvnet.files import make_folder
-    from amvnet.inference.reading import normalised
     from amvnet.outputs import check_outputs
-    from amvnet.ranking.label_errors import TABLE, write_clusters
-    from amvnet.ranking.label_errors import rank as rank_records
-    from amvnet.sensors.normalise import Normaliser
+    from amvnet.sensors.normalise import Normaliser, normalised
     from amvnet.weights.file import load
 
     # Check this before any scan is scored, so that no time is wasted.

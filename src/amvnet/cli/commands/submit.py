@@ -33,9 +33,8 @@ def submit(
         overwrite: replace the archive if it exists.
     """
     from amvnet.data.datasets.open import open_dataset
+    from amvnet.evaluation.submission import ARCHIVE, rules_for, write_archive
     from amvnet.outputs import check_outputs
-    from amvnet.submission import pack
-    from amvnet.submission.rules import rules_for
 
     rules = rules_for(open_dataset(data), split, sequences)
     if use_external and rules.meta is None:
@@ -43,9 +42,9 @@ def submit(
             f"--use-external: expected nuScenes, found {rules.taxonomy.name}; leave it out"
         )
 
-    check_outputs({out: pack.ARCHIVE}, [data], overwrite)
+    check_outputs({out: ARCHIVE}, [data], overwrite)
     with progress("packing") as step:
-        count = pack.write(rules, predictions, out, use_external=use_external, progress=step)
+        count = write_archive(rules, predictions, out, use_external=use_external, progress=step)
     packed = counted(count, "prediction")
     follow = "follows" if count == 1 else "follow"
     report(f"{out}: {packed} {follow} the rules of {rules.taxonomy.name}")

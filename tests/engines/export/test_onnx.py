@@ -25,8 +25,8 @@ from torch import Tensor
 
 import amvnet
 from amvnet.data.taxonomy import NUSCENES
-from amvnet.export import onnx as onnx_export
-from amvnet.export.onnx import describe_export
+from amvnet.engines.export import onnx as onnx_export
+from amvnet.engines.export.onnx import describe_export
 from amvnet.models.methods import MethodName
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, OnnxSegmenter
 from amvnet.scan import Scan
@@ -48,7 +48,7 @@ from fixtures.pages import DocsPage
 from fixtures.sensors import rings_of
 from fixtures.tiny import fresh_weights, street, with_intensities, without
 
-PROJECT = Path(__file__).parents[2]
+PROJECT = Path(__file__).parents[3]
 POINTS = 6000
 # The operators of the graphs that TensorRT has, by the table of its ONNX parser
 OF_TENSORRT = (

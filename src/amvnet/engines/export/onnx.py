@@ -16,11 +16,10 @@ from torch import Tensor, nn
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.engines.base import build_model
+from amvnet.engines.export.int8 import KEEPS_FIRST_LAYER, quantise
+from amvnet.engines.export.onnx_files import digest, quiet, remove_notes
 from amvnet.errors import InputError, import_optional
-from amvnet.export.int8 import KEEPS_FIRST_LAYER, calibration_scans, quantise
-from amvnet.export.onnx_files import digest, quiet, remove_notes
 from amvnet.files import atomic_write, publish, temporary_folder
-from amvnet.inference.segmentation import Verdict
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName, check_method, widest_method
 from amvnet.models.point_head import head_features, point_table
@@ -31,6 +30,7 @@ from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
 from amvnet.weights.file import Weights, load
+from amvnet.weights.verdict import Verdict
 
 GRAPH = Signature("an ONNX graph", rb"\x08.\x12.(pytorch|onnx)")
 DESCRIBED = Signature("a description of ONNX graphs", rb'\{\s*"format": ')
@@ -85,15 +85,15 @@ def export(
     weights: Weights | Path | str,
     out: Path | str,
     progress: Progress = no_progress,
-    int8: str | None = None,
+    scans: Sequence[Scan] = (),
 ) -> dict[str, dict[str, Any]]:
     """Write the graphs and `amvnet.json` into a folder.
 
     Args:
         weights: trained weights, or the name or path of a weights file.
         progress: called with the number of graphs that are done, and their total.
-        int8: convert the convolutions to int8, calibrated with these scans: a dataset, scan files
-            as `predict` takes them, or `simulated`. By default, the graphs are in float32.
+        scans: convert the convolutions to int8, calibrated with these scans, which are prepared for
+            the networks (`calibration_scans`). Without scans, the graphs are in float32.
 
     Returns:
         The descriptions of the graphs, by name. The description of a graph in float32 has the
@@ -101,14 +101,13 @@ def export(
         labels that stay.
 
     Raises:
-        InputError: if a library is missing, the weights hold no network, there are no scans, a
-            graph differs by more than `LARGEST_DIFFERENCE`, or int8 changes too many labels. The
-            folder then stays unchanged.
+        InputError: if a library is missing, the weights hold no network, a graph differs by
+            more than `LARGEST_DIFFERENCE`, or int8 changes too many labels. The folder then stays
+            unchanged.
     """
     check_libraries()
     loaded = weights if isinstance(weights, Weights) else load(weights)
     method = check_method(widest_method(loaded.parts), loaded.parts)
-    scans = [] if int8 is None else calibration_scans(int8, loaded)
 
     # Write everything into a temporary folder first.
     out = Path(out)

@@ -13,6 +13,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import Taxonomy, check_classes
@@ -23,9 +26,13 @@ from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
-from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan, check_scan
 
+CELL = 0.4  # side of a cell, metres; points in the same cell or in touching cells are connected
+# The indices of cells that touch, even if only at a corner, are at most sqrt(3) apart. The indices
+# of other cells are at least 2 apart.
+TOUCHING = 1.75  # a distance between these two, cells
+APART = 4.0  # least distance between cells of different kinds, cells
 # The radius of the sensor's vehicle, metres. Nearer points are never doubted.
 VEHICLE_RADIUS = 1.5
 # The number of additional points with doubt 0 in the mean doubt of a cluster. They keep clusters of
@@ -244,3 +251,26 @@ def write_clusters(
                 names[row["label"]],
             ]
             writer.writerow(values)
+
+
+def cluster(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """Return the (N,) int64 cluster of each point, numbered from 0.
+
+    Args:
+        xyz: (N, 3) coordinates, metres.
+        kind: (N,) integers. Points of different kinds are never in one cluster.
+    """
+    if not len(xyz):
+        return np.zeros(0, dtype=np.int64)
+
+    # The kind is a fourth coordinate of a cell, so that cells of different kinds never touch.
+    cell_of_point = np.column_stack([np.floor(xyz / CELL), kind]).astype(np.int64)
+    cells, cell_index = np.unique(cell_of_point, axis=0, return_inverse=True)
+    tree = cKDTree(cells * [1, 1, 1, APART])
+    pairs = tree.query_pairs(TOUCHING, output_type="ndarray")
+
+    touching = np.ones(len(pairs), dtype=bool)
+    shape = (len(cells), len(cells))
+    graph = coo_array((touching, (pairs[:, 0], pairs[:, 1])), shape=shape)
+    _, cluster_of_cell = connected_components(graph, directed=False)
+    return cluster_of_cell[cell_index.ravel()].astype(np.int64)

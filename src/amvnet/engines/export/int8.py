@@ -11,19 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.spacing import evenly_spaced
+from amvnet.data.datasets.base import choose_records
+from amvnet.data.datasets.open import open_dataset
+from amvnet.engines.export.onnx_files import digest, quiet, remove_notes
 from amvnet.errors import InputError
-from amvnet.export.onnx_files import digest, quiet, remove_notes
 from amvnet.files import temporary_folder
-from amvnet.inference.listing import list_inputs
 from amvnet.onnx_runner import OnnxSegmenter, open_session
 from amvnet.scan import Scan
-from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
 
 SIMULATED = "simulated"  # stands for simulated streets, as the weights' sensor sees them
 SEED = 20_261_121  # the seed of these streets, far from the seeds of any training
-MAX_SCANS = 20  # largest number of scans that are used, evenly spaced
+MAX_SCANS = 20  # largest number of scans that calibrate and check
 CHECK_EVERY = 5  # the first of every five scans is for the check, the others to calibrate
 # The least share of labels that must stay; a good calibration keeps far more.
 LEAST_AGREEMENT = 0.9
@@ -33,18 +32,12 @@ LEAST_AGREEMENT = 0.9
 KEEPS_FIRST_LAYER = {"range_net": True, "polar_map": False}
 
 
-def calibration_scans(text: str, weights: Weights) -> list[Scan]:
-    """Read up to `MAX_SCANS` scans for the calibration, or simulate streets.
-
-    Args:
-        text: a dataset, a scan file, a folder of scan files, or `SIMULATED`.
+def simulated_scans(weights: Weights) -> list[Scan]:
+    """Simulate scans for the calibration, as the weights' sensor sees them.
 
     Raises:
-        InputError: if there are no scans, one is broken, or the weights' sensor cannot be
-            simulated.
+        InputError: if the sensor cannot be simulated.
     """
-    if text != SIMULATED:
-        return _read(text, weights)
     from amvnet.data.datasets.simulated import simulate
     from amvnet.data.taxonomy import CLASSES_BY_SENSOR
 
@@ -56,7 +49,9 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
         )
     with temporary_folder() as folder:
         simulate(folder, sensor=sensor, sequences=MAX_SCANS, scans=1, seed=SEED)
-        return _read(str(folder), weights)
+        dataset = open_dataset(str(folder), weights.taxonomy)
+        records = choose_records(dataset, None, "all")
+        return [weights.expects.prepare(dataset.read(record, labels=False)) for record in records]
 
 
 def quantise(
@@ -116,24 +111,6 @@ class _Recorder(OnnxSegmenter):
             input_name = self.description["graphs"][name]["inputs"][0]["name"]
             self.recorded[name].append({input_name: inputs[0]})
         return super()._run(name, *inputs)
-
-
-def _read(text: str, weights: Weights) -> list[Scan]:
-    """Read up to `MAX_SCANS` scans, evenly spaced, prepared as `predict` prepares them."""
-    normaliser = Normaliser(weights.expects)
-    inputs, _ = list_inputs([text], taxonomy=weights.taxonomy, normaliser=normaliser)
-    scans = []
-    for scan_input in evenly_spaced(inputs, MAX_SCANS):
-        scan = scan_input.load().scan
-        if scan.valid.any():
-            scans.append(weights.expects.prepare(scan))
-
-    if not scans:
-        raise InputError(
-            f"{text}: expected scans to calibrate with, found none with a finite point; "
-            "name other scans"
-        )
-    return scans
 
 
 def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarray:

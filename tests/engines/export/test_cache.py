@@ -7,7 +7,7 @@ import json
 import os
 import stat
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,13 +17,12 @@ import numpy as np
 import pytest
 
 import amvnet
-from amvnet import cache as user_files
-from amvnet.cache import user_cache
+from amvnet.engines.export import cache
+from amvnet.engines.export.cache import cached_networks, user_cache
 from amvnet.engines.onnx import RANGE_NET, UNET
-from amvnet.export import cache
-from amvnet.export.cache import cached_networks
 from amvnet.files import unfinished
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS_BY_METHOD
+from amvnet.scan import Scan
 from amvnet.weights.file import Weights
 
 from fixtures.commands import files
@@ -43,7 +42,7 @@ class Exports:
         self.count = 0
         self.content = b"graph"
 
-    def __call__(self, weights: Weights, out: Path | str, int8: str | None = None) -> None:
+    def __call__(self, weights: Weights, out: Path | str, scans: Sequence[Scan] = ()) -> None:
         self.count += 1
         graphs = {}
         for name in GRAPHS_BY_METHOD["amvnet"]:
@@ -65,10 +64,11 @@ def exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Exports:
     monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(cache, "check_libraries", lambda: None)
     monkeypatch.setattr(cache, "export", stand_in)
+    monkeypatch.setattr(cache, "simulated_scans", lambda weights: [])
     return stand_in
 
 
-def cached(weights: Weights = WEIGHTS, int8: str | None = None) -> tuple[dict[str, bytes], str]:
+def cached(weights: Weights = WEIGHTS, int8: bool = False) -> tuple[dict[str, bytes], str]:
     """Return the contents of the graphs, and what is said."""
     said: list[str] = []
     networks = cached_networks(weights, int8, said.append)
@@ -93,7 +93,7 @@ def test_networks_are_exported_once_for_each_weights_and_precision(exports: Expo
     wider = replace(WEIGHTS, model=replace(WEIGHTS.model, range_view=view))
     folders = {filled(), filled(other), filled(wider)}
     assert exports.count == 3
-    cached(int8="simulated")
+    cached(int8=True)
     assert exports.count == 4
     assert len(folders) == 3
     assert {path.name for path in user_cache().glob("onnx/*")} > {each.name for each in folders}
@@ -172,7 +172,7 @@ def test_a_file_or_a_link_in_the_place_of_a_folder_is_replaced(
 def test_a_cache_that_another_user_can_write_is_not_used_and_that_is_said(
     place: str, mode: int, exports: Exports, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(user_files, "_is_group_of_one", lambda gid: False)
+    monkeypatch.setattr(cache, "_is_group_of_one", lambda gid: False)
     folder = filled()
     changed = (folder / place).resolve()
     before = stat.S_IMODE(changed.stat().st_mode)
@@ -232,7 +232,7 @@ def test_a_cache_of_another_user_is_not_used(
 ) -> None:
     filled()
     monkeypatch.setattr(os, "getuid", lambda: 12_345_678)
-    monkeypatch.setattr(user_files, "_is_own", lambda status: False)
+    monkeypatch.setattr(cache, "_is_own", lambda status: False)
     assert "no other user" in cached()[1]
 
 
@@ -244,10 +244,10 @@ def test_without_a_place_for_a_cache_the_networks_are_exported_for_one_run(
     monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "file" / "cache"))
     folders: list[Path] = []
 
-    def export(weights: Weights, out: Path, int8: str | None = None) -> None:
+    def export(weights: Weights, out: Path, scans: Sequence[Scan]) -> None:
         assert out in unfinished
         folders.append(out)
-        exports(weights, out, int8)
+        exports(weights, out)
 
     monkeypatch.setattr(cache, "export", export)
     for count in (1, 2):
@@ -280,7 +280,7 @@ def test_concurrent_exports_into_one_cache_all_succeed_and_leave_one_whole(
     workers = 8
     together = threading.Barrier(workers)
 
-    def export(weights: Weights, out: Path, int8: str | None = None) -> None:
+    def export(weights: Weights, out: Path, scans: Sequence[Scan]) -> None:
         own = Exports()
         own.content = str(threading.get_ident()).encode()
         own(weights, out)
@@ -307,7 +307,7 @@ def test_concurrent_exports_into_one_cache_all_succeed_and_leave_one_whole(
 def test_an_export_that_fails_leaves_nothing(
     exports: Exports, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(weights: Weights, out: Path, int8: str | None = None) -> None:
+    def fail(weights: Weights, out: Path, scans: Sequence[Scan]) -> None:
         (out / "range_net.onnx").write_bytes(b"half")
         raise KeyboardInterrupt
 
@@ -337,7 +337,7 @@ def test_weights_of_one_network_have_one_graph(
         WEIGHTS, tensors={k: v for k, v in WEIGHTS.tensors.items() if k.startswith("range_net.")}
     )
 
-    def export(weights: Weights, out: Path, int8: str | None = None) -> None:
+    def export(weights: Weights, out: Path, scans: Sequence[Scan]) -> None:
         exports(weights, out)
         text = (out / DESCRIPTION).read_text()
         description: dict[str, Any] = json.loads(text) | {"method": "rv"}

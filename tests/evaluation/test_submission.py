@@ -12,8 +12,7 @@ import pytest
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.submission import pack as submission
-from amvnet.submission.rules import rules_for
+from amvnet.evaluation.submission import rules_for, write_archive
 from amvnet.weights.file import save
 
 from fixtures.commands import (
@@ -122,7 +121,7 @@ def peak_memory(root: Path, scans: int, points: int) -> int:
 
     rules = rules_for(open_dataset(str(root)), "val")
     out = root / "s.zip"
-    _, peak = measured(lambda: submission.write(rules, root, out))
+    _, peak = measured(lambda: write_archive(rules, root, out))
     return peak
 
 

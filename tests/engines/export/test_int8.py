@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 from amvnet.data.taxonomy import NUSCENES
-from amvnet.export import int8 as int8_export
-from amvnet.export import onnx as onnx_export
-from amvnet.export.int8 import calibration_scans
+from amvnet.engines.export import int8 as int8_export
+from amvnet.engines.export import onnx as onnx_export
+from amvnet.inference.calibration import calibration_scans
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES
@@ -77,7 +77,9 @@ def exported(weights: Weights, scans: Path, tmp_path_factory: pytest.TempPathFac
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(onnx_export, "quantise", copy_and_quantise)
-        graphs = onnx_export.export(weights, folders.int8, int8=str(scans))
+        graphs = onnx_export.export(
+            weights, folders.int8, scans=calibration_scans(str(scans), weights)
+        )
     assert {name for name, graph in graphs.items() if "agreement" in graph} == set(QUANTISED)
     return folders
 
@@ -139,7 +141,7 @@ def test_convolutions_hold_integers_nearest_to_their_weights(exported: Folders, 
 @pytest.mark.full
 def test_the_gru_stays_in_float32(weights: Weights, scans: Path, tmp_path: Path) -> None:
     deep = without(fresh_weights(), "polar_net", "point_head")
-    onnx_export.export(deep, tmp_path, int8=str(scans))
+    onnx_export.export(deep, tmp_path, scans=calibration_scans(str(scans), deep))
     model = load_model(tmp_path, "range_net")
     nodes = nodes_by_output(model)
     layers = [node for node in model.graph.node if node.op_type == "GRU"]
@@ -176,7 +178,7 @@ def test_the_description_says_which_graphs_are_in_int8(exported: Folders, scans:
 def test_the_graphs_say_nothing_of_the_machine(exported: Folders) -> None:
     assert files(exported.float32) == files(exported.int8)
     for path in exported.int8.iterdir():
-        for word in (str(Path(__file__).parents[2]), sys.prefix, "site-packages"):
+        for word in (str(Path(__file__).parents[3]), sys.prefix, "site-packages"):
             assert word.encode() not in path.read_bytes(), path.name
 
 
@@ -199,7 +201,9 @@ def check_refused(weights: Weights, int8: str, folder: Path, word: str) -> None:
     """Check that an export in int8 fails with a word in one line, and leaves no files."""
     polar_only = without(weights, "range_net")
     out = folder / "out"
-    fails(lambda: onnx_export.export(polar_only, out, int8=int8), word)
+    fails(
+        lambda: onnx_export.export(polar_only, out, scans=calibration_scans(int8, polar_only)), word
+    )
     assert not files(out)
 
 

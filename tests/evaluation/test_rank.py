@@ -18,10 +18,11 @@ from amvnet import Scan
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.ranking.clusters import CELL, cluster
-from amvnet.ranking.label_errors import (
+from amvnet.evaluation.label_errors import (
+    CELL,
     VEHICLE_RADIUS,
     PointDoubts,
+    cluster,
     find_clusters,
     measure_doubts,
     rank,

@@ -1,0 +1,1 @@
+"""Export the networks for ONNX Runtime: graphs in float32 and int8, and their cache."""

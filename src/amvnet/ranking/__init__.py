@@ -1,1 +1,0 @@
-"""Rank labels that may be wrong, the most doubtful labels first."""

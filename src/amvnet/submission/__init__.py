@@ -1,1 +1,0 @@
-"""Write archives of predictions for the benchmarks' servers."""
