@@ -131,12 +131,15 @@ def _sides(xyz: NDArray[np.floating], plane: NDArray[np.floating]) -> tuple[floa
 def _lowest_points(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the lowest point of each of the M cells that have points: (M, 3)."""
     column, row = np.floor((xyz[:, :2] + MAX_DISTANCE) / CELL_SIDE).astype(np.int64).T
-    cell = column * int(2 * MAX_DISTANCE / CELL_SIDE + 1) + row
+    side = int(2 * MAX_DISTANCE / CELL_SIDE + 1)
+    cell = column * side + row
 
-    order = np.lexsort((xyz[:, 2], cell))
-    is_first = np.diff(cell[order], prepend=-1) > 0
-    lowest: NDArray[np.floating] = xyz[order][is_first]
-    return lowest
+    heights = np.full(side * side, np.inf)
+    np.minimum.at(heights, cell, xyz[:, 2])
+    lowest = xyz[:, 2] == heights[cell]  # several points of a cell may be equally low
+    _, first = np.unique(cell[lowest], return_index=True)
+    found: NDArray[np.floating] = xyz[lowest][first]
+    return found
 
 
 def _best_plane(

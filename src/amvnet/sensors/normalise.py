@@ -39,8 +39,12 @@ from amvnet.sensors.measure import (
 MAX_OUTSIDE_SHARE = 0.16  # limit of the share of the points outside a field of view that suffices
 
 
-def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> Scan:
-    """Return a scan as some weights expect it; its points keep their order and number.
+def normalise(
+    cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation
+) -> tuple[Scan, str]:
+    """Return a scan as some weights expect it, and what was wrong with its rings.
+
+    The points keep their order and number.
 
     The scan is levelled and moved to the height of the training's sensor. If the weights' rows are
     lasers and the scan's lasers are known, the lasers decide `Scan.row`. Otherwise the elevations
@@ -55,7 +59,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     to_intensity = _intensity_map(cloud, estimate.quantiles, sensor, expected)
     intensity = to_intensity(cloud.intensity, len(cloud.xyz))
     height = expected.sensor.height
-    seen, _ = seen_scan(cloud, estimate.frame, sensor, height, intensity)
+    seen, ring_fault = seen_scan(cloud, estimate.frame, sensor, height, intensity)
     seen, _ = fill_intensity(seen, expected.intensity)
     to_sensor, to_trained = estimate.frame.rises(sensor, height)
     moved = raise_points(seen, to_trained - to_sensor)
@@ -64,13 +68,18 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     row = _rows_by_laser(seen, estimate.frame.complete(sensor), lasers, expected)
     if row is None:
         row = _rows(seen, lasers, expected)
-    return dataclasses.replace(moved, row=row)
+    return dataclasses.replace(moved, row=row), ring_fault
 
 
-def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
-    """Return one line: what is assumed about a scan, and whether the weights know its sensor."""
+def describe(
+    cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation, ring_fault: str
+) -> str:
+    """Return one line: what is assumed about a scan, and whether the weights know its sensor.
+
+    Args:
+        ring_fault: what was wrong with the rings of the scan, as `normalise` returns it.
+    """
     lasers = estimate.lasers.override(sensor)
-    _, ring_fault = seen_scan(cloud, estimate.frame, sensor, expected.sensor.height)
     assumed = [
         cloud.note,
         _intensity_map(cloud, estimate.quantiles, sensor, expected).text,
@@ -156,12 +165,12 @@ class Normaliser:
         recording = self.measure(source)
         estimate, is_usual = recording.estimate(cloud)
         self._check_height(cloud, estimate.frame)
-        scan = normalise(cloud, estimate, self.sensor, self.expected)
+        scan, ring_fault = normalise(cloud, estimate, self.sensor, self.expected)
 
         title = source if is_usual else f"{source}, other sensors"
         if title not in self._reported:
             self._reported.add(title)
-            line = describe(cloud, estimate, self.sensor, self.expected)
+            line = describe(cloud, estimate, self.sensor, self.expected, ring_fault)
             if recording.is_mixed:
                 line += f"; {source} has scans of other sensors, so that each is measured alone"
             if not is_usual:
