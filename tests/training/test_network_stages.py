@@ -19,6 +19,7 @@ from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.models.amvnet import build_amvnet
+from amvnet.models.layers import RingConv2d
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
@@ -103,6 +104,27 @@ def test_a_voxel_with_points_of_two_datasets_has_the_first_as_its_source() -> No
         )
     assert scored.source is not None
     assert dict(zip(scored.labels.tolist(), scored.source.tolist(), strict=True)) == {1: 1, 2: 2}
+
+
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+def test_on_a_cpu_all_convolutions_of_a_training_step_have_channels_last(stage: str) -> None:
+    config = replace(MODEL_CONFIG, range_net=replace(MODEL_CONFIG.range_net, steps=True))
+    plan = plan_with(CONFIG)
+    training = replace(plan.recipe.training, accelerator="cpu")
+    plan = replace(plan, recipe=Recipe(training=training))
+    made = make_stage(plan, stage, build_amvnet(config, 19), None, ALL)
+    are_last: list[bool] = []
+
+    def note(net: nn.Module, inputs: Any, output: torch.Tensor) -> None:
+        are_last.append(output.is_contiguous(memory_format=torch.channels_last))
+
+    for layer in made.trained.modules():
+        if isinstance(layer, RingConv2d):
+            layer.register_forward_hook(note)
+    points, labels = batch_of_two()
+    made.compare((points, labels, points.scan))
+    assert are_last
+    assert all(are_last)
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])

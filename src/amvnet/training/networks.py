@@ -18,6 +18,7 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import counted
+from amvnet.runtime.distributed import device_of
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.checking import Checked
 from amvnet.training.loaders import ScanSet, make_loader
@@ -337,6 +338,9 @@ def make_stage(
         "precision": precision_of(plan.recipe.training),
     }
     net = model.range_net if name == "rv" else model.polar_net
+    # On a CPU, convolutions are faster if channels are last in memory. They follow their kernels.
+    if device_of(plan.recipe.training.accelerator) == "cpu":
+        net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if config.distill and rivals is not None:
         shared["teacher"] = copy.deepcopy(net)
     if name == "rv":
