@@ -23,6 +23,7 @@ from amvnet.sensors.lasers import SensorGeometry, elevations
 from amvnet.sensors.lidars import (
     BUILT_IN,
     KNOWN_SENSORS,
+    UNITS,
     Sensor,
     make_sensor,
     rotation_from_degrees,
@@ -35,6 +36,7 @@ from amvnet.sensors.measure import (
     raise_points,
     seen_scan,
 )
+from amvnet.sensors.own_body import own_points
 
 MAX_OUTSIDE_SHARE = 0.16  # limit of the share of the points outside a field of view that suffices
 
@@ -42,7 +44,8 @@ MAX_OUTSIDE_SHARE = 0.16  # limit of the share of the points outside a field of 
 def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> Scan:
     """Return a scan as some weights expect it; its points keep their order and number.
 
-    The scan is levelled and moved to the height of the training's sensor. If the weights' rows are
+    The scan is levelled and moved to the height of the training's sensor. Points of the car's own
+    body are marked (`own_points`). If the weights' rows are
     lasers and the scan's lasers are known, the lasers decide `Scan.row`. Otherwise the elevations
     decide it, under which the sensor saw the points before the move.
 
@@ -64,7 +67,8 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     row = _rows_by_laser(seen, estimate.frame.complete(sensor), lasers, expected)
     if row is None:
         row = _rows(seen, lasers, expected)
-    return dataclasses.replace(moved, row=row)
+    own = own_points(cloud.xyz * UNITS[estimate.frame.unit], cloud.ring, sensor)
+    return dataclasses.replace(moved, row=row, own=own)
 
 
 def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
@@ -198,7 +202,9 @@ class Normaliser:
 
     def for_sensor(self, sensor: Sensor) -> Normaliser:
         """Return a normaliser for the same weights and the scans of a described sensor."""
-        return Normaliser(self.expected, sensor, self._report)
+        keep_own = self.sensor.keep_own or sensor.keep_own
+        described = dataclasses.replace(sensor, keep_own=keep_own)
+        return Normaliser(self.expected, described, self._report)
 
     def target(self) -> SensorGeometry:
         """Return the geometry of a sensor for weights that are trained on the normalised scans.
