@@ -277,12 +277,10 @@ class Pipeline:
         points = int(np.count_nonzero(loaded.scan.valid))
         uncertain = round(result.doubt * points)
         key = _key(scan)
-        own = loaded.scan.own
-        counts = np.bincount(result.labels if own is None else result.labels[~own])
-        own_count = 0 if own is None else int(np.count_nonzero(own))
-        return Entry(
-            key, self._origins[key], scan.source, points, uncertain, own_count, counts.tolist()
-        )
+        own = np.zeros(len(result), bool) if loaded.scan.own is None else loaded.scan.own
+        counts = np.bincount(result.labels[~own]).tolist()
+        own_count = int(np.count_nonzero(own))
+        return Entry(key, self._origins[key], scan.source, points, uncertain, counts, own_count)
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:
