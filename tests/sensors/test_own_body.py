@@ -34,7 +34,9 @@ def own_of(points: np.ndarray, **sensor: Any) -> np.ndarray:
     return np.zeros(len(points), bool) if own is None else own
 
 
-@pytest.mark.parametrize("how", [{}, {"axes": "y-forward"}, {"sensor": "hdl32e"}, {"rotate": "0,9,0"}])
+@pytest.mark.parametrize(
+    "how", [{}, {"axes": "y-forward"}, {"sensor": "hdl32e"}, {"rotate": "0,9,0"}]
+)
 def test_the_body_of_nuscenes_car_is_known_in_the_axes_of_its_files(how: dict[str, str]) -> None:
     points, _ = on_nuscenes_car()
     own = own_of(points, **how)
