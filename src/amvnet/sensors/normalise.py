@@ -131,7 +131,7 @@ class Normaliser:
         self._report = report
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
-        self._reported: set[str] = set()  # recordings whose line was already reported
+        self._reported: set[str] = set()  # recordings whose line was reported, and such lines
         self._described: list[tuple[str, Estimate]] = []  # notes and estimates in these lines
 
     def quiet(self) -> None:
@@ -241,12 +241,14 @@ class Normaliser:
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
 
         if source not in self._reported:
-            self._reported.add(source)
             has_intensity = cloud.intensity is not None and scale is not None
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
             negative = _describe_negative(cloud)
-            assumed = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
-            self._report(f"{cloud.name}: assumed {', '.join(filter(None, assumed))}")
+            parts = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
+            assumed = ", ".join(filter(None, parts))
+            if assumed not in self._reported:
+                self._report(f"{cloud.name}: assumed {assumed}")
+            self._reported |= {source, assumed}
         return scan
 
 
