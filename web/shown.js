@@ -19,7 +19,7 @@ export function shownScan(name, { points, count }, segmentation, description) {
   const stride = Math.max(1, Math.ceil(near.length / MAX_POINTS)), indices = near.filter((_, place) => place % stride === 0);
 
   const leftOut = count - near.length, notes = [];
-  if (leftOut) notes.push(`${counted(leftOut)} without a position or beyond ${REACH} m`);
+  if (leftOut) notes.push(`${counted(leftOut)} without a position, of the car itself or beyond ${REACH} m`);
   if (stride > 1) notes.push(`one in ${stride} of the scan`);
   const scan = { name, index: 0, count: indices.length, note: notes.join("; "), ...quantised(points, indices) };
   const byte = (value) => Math.round(Math.min(Math.max(value, 0), 1) * 255);

@@ -23,6 +23,8 @@ from amvnet.errors import InputError, errors_of, reason_of
 from amvnet.models.neighbours import nearest_others
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
 from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.own_body import mark_own
 
 DESCRIPTION = "amvnet.json"  # name of the file that describes the graphs in its folder
 LONGEST_NAME = 200  # longest file name of a graph, characters
@@ -65,19 +67,24 @@ class OnnxSegmenter:
     Args:
         folder: the output folder of `amvnet export`.
         providers: ONNX Runtime's execution providers, the preferred one first.
+        keep_own: label the points of the car's own body as others. By default, they get the id 0.
 
     Raises:
         InputError: if the folder is incomplete, or ONNX Runtime is not installed.
     """
 
     def __init__(
-        self, folder: Path | str, providers: Sequence[str] = ("CPUExecutionProvider",)
+        self,
+        folder: Path | str,
+        providers: Sequence[str] = ("CPUExecutionProvider",),
+        keep_own: bool = False,
     ) -> None:
         folder = Path(folder)
         description = read_description(folder)
         source = str(folder)
 
         self.description = description
+        self.keep_own = keep_own
         self.method: str = description["method"]
         self.range_view = from_dict(RangeViewConfig, description.get("range_view", {}), source)
         self.polar_view = from_dict(PolarViewConfig, description.get("polar_view", {}), source)
@@ -112,7 +119,7 @@ class OnnxSegmenter:
             ring = None if ring is None else np.asarray(ring)
             with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: not valid
                 table = as_array(points, "points of shape (N, 4)").astype(np.float32)
-            scan = Scan(table, ring=ring)
+            scan = mark_own(check_scan(Scan(table, ring=ring)), Sensor(keep_own=self.keep_own))
         scan = self.expects.prepare(check_scan(scan))
 
         valid = scan.valid

@@ -32,6 +32,8 @@ class Scan:
             unknown), or None. The range view computes rows that are unknown.
         source: (N,) int64 index of the dataset that each point comes from (0 = the first),
             or None. A training on several datasets sets it.
+        own: (N,) bool: whether a point is of the car's own body, or None if none is known to be.
+            Such points are not valid.
         name: the origin of the scan, for messages.
 
     Raises:
@@ -44,6 +46,7 @@ class Scan:
     name: str = ""
     row: np.ndarray | None = None
     source: np.ndarray | None = None
+    own: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4:
@@ -56,6 +59,7 @@ class Scan:
         self._check_count("ring indices", self.ring)
         self._check_count("rows", self.row)
         self._check_count("sources", self.source)
+        self._check_count("flags of own points", self.own)
 
     def _check_count(self, kind: str, values: np.ndarray | None) -> None:
         if values is None or values.shape == (len(self.points),):
@@ -90,11 +94,15 @@ class Scan:
             ring=None if self.ring is None else self.ring[which],
             row=None if self.row is None else self.row[which],
             source=None if self.source is None else self.source[which],
+            own=None if self.own is None else self.own[which],
         )
 
     @property
     def valid(self) -> np.ndarray:
-        """(N,) bool: whether a point is at finite coordinates within `FARTHEST`, not the origin."""
+        """(N,) bool: whether networks see a point and label it.
+
+        It is at finite coordinates within `FARTHEST`, not at the origin, and not of the car itself.
+        """
         # Comparisons with NaN are false.
         if np.abs(self.points).max(initial=0) < FARTHEST:
             valid = np.ones(len(self.points), dtype=bool)
@@ -103,7 +111,7 @@ class Scan:
             valid = (np.abs(self.points.T[:3], order="C") < FARTHEST).all(axis=0)
 
         valid[at_origin(self.points)] = False
-        return valid
+        return valid if self.own is None else valid & ~self.own
 
 
 def at_origin(xyz: NDArray[np.floating]) -> NDArray[np.intp]:

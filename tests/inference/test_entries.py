@@ -21,7 +21,7 @@ from amvnet import onnx_runner
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData
-from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.engines.export.onnx import describe_export, export
 from amvnet.errors import InputError
 from amvnet.evaluation.scoring import label_by_weights
@@ -45,9 +45,10 @@ from amvnet.weights.file import save
 from amvnet_ros.segmentation import CloudSegmenter, Settings
 
 from fixtures.commands import fails, succeed
+from fixtures.datasets import make_nuscenes
 from fixtures.marks import with_full, with_quick
 from fixtures.scan_writers import cloud_message
-from fixtures.sensors import LASERS, place
+from fixtures.sensors import LASERS, is_on_nuscenes_car, on_nuscenes_car, place
 from fixtures.tiny import (
     fresh_weights,
     street,
@@ -125,10 +126,19 @@ class World:
 
     folder: Path
     weights: Path
+    keep_own: bool = False
 
     @cached_property
     def segmenter(self) -> Segmenter:
-        return amvnet.load(self.weights)
+        return amvnet.load(self.weights, keep_own=self.keep_own)
+
+    @property
+    def normaliser(self) -> Normaliser:
+        return Normaliser(self.segmenter.weights.expects, Sensor(keep_own=self.keep_own))
+
+    @property
+    def options(self) -> str:
+        return f"--weights {self.weights} --overwrite" + " --keep-own" * self.keep_own
 
     def write(self, points: np.ndarray) -> Path:
         path = self.folder / "scan.npy"
@@ -198,13 +208,12 @@ def by_each(world: World, points: np.ndarray) -> np.ndarray:
 
 def by_predict(world: World, points: np.ndarray) -> np.ndarray:
     out = world.folder / "out"
-    succeed(f"predict {world.write(points)} --weights {world.weights} --out {out} --overwrite")
+    succeed(f"predict {world.write(points)} --out {out} {world.options}")
     return world.read(out / "scan.label")
 
 
 def by_view(world: World, points: np.ndarray) -> np.ndarray:
-    normaliser = Normaliser(world.segmenter.weights.expects)
-    scans, _ = list_inputs([str(world.write(points))], normaliser=normaliser)
+    scans, _ = list_inputs([str(world.write(points))], normaliser=world.normaliser)
     (shown,) = show_scans(scans, world.segmenter)
     return shown.labels["amvnet"]
 
@@ -217,7 +226,8 @@ def by_evaluate(world: World, points: np.ndarray) -> np.ndarray:
 def by_node(world: World, points: np.ndarray) -> np.ndarray:
     """Label a message as the ROS node does."""
     message = cloud_message(get_typestore(Stores.ROS2_HUMBLE), scan_of(points).points)
-    label = CloudSegmenter(Settings(weights=str(world.weights)), "/lidar", lambda line: None)
+    settings = Settings(weights=str(world.weights), keep_own=world.keep_own)
+    label = CloudSegmenter(settings, "/lidar", lambda line: None)
     return SEMANTICKITTI.to_train(label(message).points.raw)
 
 
@@ -307,6 +317,50 @@ def test_the_onnx_runner_gives_a_scan_the_same_labels(runner: OnnxSegmenter, nam
         expected = amvnet.load(WEIGHTS, method="rv")(points).labels
     np.testing.assert_array_equal(labels == 0, is_lost(points))
     assert (labels == expected).mean() > 0.995
+
+
+@pytest.mark.parametrize("keep_own", [False, True])
+def test_every_entry_leaves_the_own_car_without_a_label_unless_told_to_keep_it(
+    by_laser: World, keep_own: bool
+) -> None:
+    points, laser = on_nuscenes_car()
+    points[0, 3] = 1
+    points = np.column_stack([points, laser])
+    own = np.array(list(map(is_on_nuscenes_car, points)))
+    world = World(by_laser.folder, by_laser.weights, keep_own)
+    entries = [by_tensor, by_list, by_fields, by_many, by_path, by_each, by_predict, by_view]
+    for entry in (*entries, by_node, labels_of_runner, *([] if keep_own else [by_evaluate])):
+        with no_warnings():
+            labels = entry(world, points)
+        np.testing.assert_array_equal(labels == 0, own & ~keep_own, entry.__name__)
+
+
+@pytest.mark.parametrize("keep_own", [False, True])
+def test_official_predictions_and_scores_of_nuscenes_label_the_own_car(
+    tmp_path: Path, keep_own: bool
+) -> None:
+    """Its server wants a class for each point, and some of its labels call this body a car."""
+    layout = make_nuscenes(tmp_path / "data")
+    points, laser = on_nuscenes_car()
+    own = np.array(list(map(is_on_nuscenes_car, points)))
+    table = np.column_stack([points * [1, 1, 1, 255], laser])
+    table.astype(np.float32).tofile(layout.first_points)
+    np.full(len(points), 1, np.uint8).tofile(layout.first_labels)
+    weights = fresh_weights(NUSCENES)
+    segmenter = amvnet.load(weights, keep_own=keep_own)
+
+    dataset = open_dataset(layout.spec)
+    record, _ = dataset.records([layout.sequences[0]])
+    assert label_by_weights(dataset, segmenter).label(record, dataset.read(record)).ids["rv"].all()
+    (result,) = [each for each in segmenter.each(layout.spec) if len(each) == len(points)]
+    np.testing.assert_array_equal(result.labels == 0, own & ~keep_own)
+
+    save(weights, tmp_path / "tiny.safetensors")
+    succeed(
+        f"predict {layout.spec} --sequences {layout.sequences[0]} --out {tmp_path / 'out'} "
+        f"--weights {tmp_path / 'tiny.safetensors'}"
+    )
+    assert np.fromfile(tmp_path / "out" / record.prediction, np.uint8).all()
 
 
 # What the networks get: weights whose rows are lasers, and whose intensities are matched.
@@ -459,14 +513,18 @@ class BlindRunner(OnnxSegmenter):
 
 
 def by_runner(world: World, points: np.ndarray) -> None:
+    labels_of_runner(world, points)
+
+
+def labels_of_runner(world: World, points: np.ndarray) -> np.ndarray:
     graphs = {"range_net": {"file": "range_net.onnx", "inputs": []}}
     description = describe_export(BY_LASER, "rv", graphs)
     (world.folder / onnx_runner.DESCRIPTION).write_text(json.dumps(description))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(onnx_runner, "_open_graph", lambda *_: None)
-        runner = BlindRunner(world.folder)
+        runner = BlindRunner(world.folder, keep_own=world.keep_own)
     scan = scan_of(points)
-    runner(scan.points, scan.ring)
+    return runner(scan.points, scan.ring).labels
 
 
 @pytest.mark.parametrize("make", with_quick(ODD, (shuffled, with_lost_returns, *WITH_RINGS[:1])))

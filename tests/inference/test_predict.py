@@ -453,12 +453,12 @@ def test_the_end_counts_the_classes_of_the_label_files_and_names_commands_that_r
 @pytest.mark.parametrize(
     ("text", "done"),
     [
-        ('["a","0f","drive",10,3,[1]]\n["b","0f","drive",10,3,[1]]\n', 2),
-        ('["a","0f","drive",10,3,[1]]\n["b","0f","drive",10,3,[1]]', 1),
-        ('["a","0f","drive",10,3,[1]]\n["b","0f', 1),
-        ('["a","0f","drive",10,3,[1]]\n\x00\n["b","0f","drive",10,3,[1]]\n{}\n', 2),
-        ('["a","0f","drive",10,3,[1]]\n["b","0f","drive","10",3,[1]]\n"b"\n', 1),
-        ('["a","0f","drive",10,3,[1]]\n' + "[" * 100_000 + "\n", 1),
+        ('["a","0f","drive",10,3,[1],0]\n["b","0f","drive",10,3,[1],0]\n', 2),
+        ('["a","0f","drive",10,3,[1],0]\n["b","0f","drive",10,3,[1],0]', 1),
+        ('["a","0f","drive",10,3,[1],0]\n["b","0f', 1),
+        ('["a","0f","drive",10,3,[1],0]\n\x00\n["b","0f","drive",10,3,[1],0]\n{}\n', 2),
+        ('["a","0f","drive",10,3,[1],0]\n["b","0f","drive","10",3,[1],0]\n"b"\n', 1),
+        ('["a","0f","drive",10,3,[1],0]\n' + "[" * 100_000 + "\n", 1),
     ],
 )
 def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, text: str, done: int) -> None:

@@ -287,6 +287,18 @@ def test_what_was_assumed_is_said_once_for_a_source() -> None:
     assert len(lines) == 2
 
 
+def test_recordings_that_are_only_looked_at_share_a_line_if_they_are_alike() -> None:
+    lines: list[str] = []
+    normaliser = Normaliser(report=lines.append)
+    points, _ = place(LASERS["vlp16"], 0.9)
+    for source in ("site_a", "site_b", "site_a"):
+        normaliser(make_cloud(points), source)
+    assert len(lines) == 1
+    normaliser(make_cloud(points * np.array([1, 1, 1, 255], np.float32)), "site_c")
+    assert len(lines) == 2
+    assert "0 to 255" in lines[1]
+
+
 @pytest.mark.parametrize(
     ("stated", "words"),
     [

@@ -38,7 +38,7 @@ from amvnet.weights.file import load
 from fixtures.marks import with_quick
 from fixtures.processes import PATIENCE
 from fixtures.scan_writers import WRITERS, pcd_bytes, some_points
-from fixtures.sensors import LASERS, place
+from fixtures.sensors import LASERS, on_nuscenes_car, place
 
 NODE = shutil.which("node")
 PAGE = Path(__file__).parents[2] / "web"
@@ -152,6 +152,17 @@ def nuscenes_like(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
     path = write_bin(folder / "nuscenes_like.pcd.bin", with_ring(points, laser))
     return Case(path, "sim-hdl32e", rows="ring")
+
+
+def on_the_car_of_nuscenes(folder: Path) -> Case:
+    points, laser = on_nuscenes_car()
+    path = write_bin(folder / "own_car.pcd.bin", with_ring(points, laser))
+    return Case(path, "sim-hdl32e", rows="ring")
+
+
+def near_points_of_another_sensor(folder: Path) -> Case:
+    points, laser = on_nuscenes_car(sensor="os1-64")
+    return Case(write_bin(folder / "near.bin", with_ring(points, laser)), rows="laser")
 
 
 def with_lasers_in_a_column(folder: Path) -> Case:
@@ -297,6 +308,8 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     in_another_order,
     by_elevation,
     nuscenes_like,
+    on_the_car_of_nuscenes,
+    near_points_of_another_sensor,
     with_lasers_in_a_column,
     higher_with_lost_returns,
     of_another_sensor,

@@ -12,7 +12,7 @@ const AXES = {
   "y-up": [[0, 0, -1], [-1, 0, 0], [0, 1, 0]],  // x right, y up, z backward: computer graphics
 };
 const UP_AXES = ["z-down", "z-forward", "y-up"];  // the axes to try if no ground is found below
-const UNITS = { m: 1, mm: 0.001 };  // the length of each unit, metres
+export const UNITS = { m: 1, mm: 0.001 };  // the length of each unit, metres
 
 // The median distance of the points tells the unit. In metres, it is 2 to 40 with all sensors. Between the two limits,
 // the unit may be centimetres or millimetres.

@@ -2,7 +2,7 @@
 
 import { InputError } from "../errors.js";
 import { isPlaced } from "../reading/cloud.js";
-import { findFrame, isOnGround, risesOf, tilted, toLevel } from "./frame.js";
+import { findFrame, isOnGround, risesOf, tilted, toLevel, UNITS } from "./frame.js";
 import { NEAREST } from "./ground.js";
 import { fillIntensity, intensityMap, matchIntensity, missingText, negativeText } from "./intensity.js";
 import { elevationOf, hasEndsOf, orderRings, rowsOf } from "./rows.js";
@@ -10,6 +10,9 @@ import { quantilesOf } from "./statistics.js";
 
 const FARTHEST = 10_000;  // the limit of coordinates, metres; no LiDAR sees so far
 const LEAST_POINTS = 100;  // the least number of points on which a sensor is measured
+const LEAST_OWN = 0.15;  // the least share of a scan's points that shows the body of the car
+// The body of nuScenes' car in the frame of its files, metres, and the field of view of its sensor.
+const BODY = { low: [-0.71, -1.18, -0.93], high: [0.71, 2.07, 0.01], sensor: { beams: 32, fov_up: 10.67, fov_down: -30.67 } };
 const SAME_BEAMS = 1.4;  // the largest ratio of two numbers of lasers that are alike
 
 /**
@@ -32,12 +35,12 @@ export function normalise(cloud, expected) {
   const rows = rowsOf(seen, tilted(seen, frame), ring, lasers, expected);
 
   fillIntensity(points);
-  const moved = raised(points, toTrained);
-  matchIntensity(moved, expected.intensity);
+  const kept = withoutOwn(raised(points, toTrained), rows, places, { xyz, lasers, unit: frame.unit });
+  matchIntensity(kept.points, expected.intensity);
   const texts = [map.text, missingText(cloud), negativeText(cloud), ...frameTexts(frame)];
   texts.push(heightText(frame, sensor.height), fault, lasersText(lasers));
   const isLike = isLikeOf(lasers, sensor), text = `assumed ${texts.filter(Boolean).join(", ")}`;
-  return { count, points: moved, rows, places, text: isLike === false ? text + strangeText(sensor) : text, isLike };
+  return { count, ...kept, text: isLike === false ? text + strangeText(sensor) : text, isLike };
 }
 
 /** Return the points (4 n, float32) at finite coordinates that are not the origin, and their places in the cloud. */
@@ -55,6 +58,23 @@ function validPoints(xyz, intensity, name) {
   }
   if (!filled) throw new InputError(`${name}: ${whyUnusable(count, isFar)}`);
   return { points: points.subarray(0, 4 * filled), places: places.subarray(0, filled) };
+}
+
+/**
+ * Return {points, rows, places} of n points without those of the car's own body, if the scan shows a body that is known:
+ * nuScenes' car, which has many points of every scan.
+ */
+function withoutOwn(points, rows, places, { xyz, lasers, unit }) {
+  const isOwn = (place) => [0, 1, 2].every((axis) => {
+    const value = xyz[3 * place + axis] * UNITS[unit];
+    return value >= BODY.low[axis] && value <= BODY.high[axis];
+  });
+  const kept = Uint32Array.from(places.keys()).filter((i) => !isOwn(places[i]));
+  const share = (places.length - kept.length) / (xyz.length / 3);
+  if (share < LEAST_OWN || !isLikeOf(lasers, BODY.sensor)) return { points, rows, places };
+  const result = new Float32Array(4 * kept.length);
+  kept.forEach((i, row) => result.set(points.subarray(4 * i, 4 * i + 4), 4 * row));
+  return { points: result, rows: rows && Int32Array.from(kept, (i) => rows[i]), places: kept.map((i) => places[i]) };
 }
 
 function whyUnusable(count, isFar) {

@@ -39,6 +39,7 @@ class Settings:
     axes: str = _parameter("", "x-forward, y-forward, z-forward, z-down or y-up; empty: measured")
     rotate: str = _parameter("", "yaw,pitch,roll in degrees that level the scan; empty: measured")
     offset: str = _parameter("", "x,y,z in metres, added after the rotation")
+    keep_own: bool = _parameter(False, "also label the points of the car's own body")
     odom_frame: str = _parameter(
         "", "a frame of tf that stands still, such as odom: fuse past scans; empty: no fusion"
     )
@@ -53,6 +54,7 @@ class Settings:
             "axes": self.axes or None,
             "rotate": self.rotate or None,
             "offset": self.offset or None,
+            "keep_own": self.keep_own or None,
         }
 
 

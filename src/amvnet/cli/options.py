@@ -182,6 +182,8 @@ class SensorChoice:
     offset: str | None = None
     """the vector x,y,z in metres that is added after the rotation, so that the sensor is at the
     origin; default: 0,0,0."""
+    keep_own: bool = False
+    """also label the points of the car's own body, which otherwise get no label."""
 
     def parse(self) -> Sensor:
         """Return the sensor with the attributes that are known.
@@ -191,7 +193,7 @@ class SensorChoice:
         """
         from amvnet.sensors.lidars import make_sensor
 
-        return make_sensor(**asdict(self))
+        return make_sensor(**asdict(self) | {"keep_own": self.keep_own or None})
 
 
 @dataclass(frozen=True)
@@ -317,7 +319,7 @@ def given_options(choice: Any) -> list[str]:
         value = getattr(choice, field.name)
         if value != field.default:
             text = ",".join(value) if isinstance(value, tuple) else str(value)
-            words.append(f"{flag_of(field.name)}={text}")
+            words.append(flag_of(field.name) + ("" if value is True else f"={text}"))
     return words
 
 

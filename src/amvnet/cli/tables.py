@@ -16,6 +16,7 @@ from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.check import Report
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.evaluation.metrics import OVERALL
+from amvnet.inference.journal import Entry
 from amvnet.inference.timing import MEAN, STAGES
 from amvnet.models.methods import title_of
 from amvnet.progress import counted
@@ -80,11 +81,12 @@ def contents_table(report: Report) -> Table:
     return table
 
 
-def labelled_table(counts: Sequence[Sequence[int]], taxonomy: Taxonomy) -> Table:
-    """Return the table of the points of each class, most first, of the counts (K + 1,) of scans."""
+def labelled_table(entries: Sequence[Entry], taxonomy: Taxonomy) -> Table:
+    """Return the table of the points of each class in the labels of some scans, most first."""
     totals = Counter[str]()
-    for of_scan in counts:
-        totals.update(dict(zip(taxonomy.names, of_scan, strict=False)))
+    for entry in entries:
+        totals.update(dict(zip(taxonomy.names, entry.counts, strict=False)))
+        totals["own car (no label)"] += entry.own
     table = Table(show_edge=False)
     table.add_column("class")
     table.add_column("points", justify="right")

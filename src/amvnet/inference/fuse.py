@@ -26,6 +26,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import AnyArray, Scan, as_array
 from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights, load
 
@@ -166,7 +167,8 @@ def fuse_files(
     fusion = Fusion(head, tau)
     if head is not None:
         taxonomy = head.taxonomy
-    scans, taxonomy = list_inputs(inputs, options, taxonomy, Normaliser(fusion.expects))
+    normaliser = Normaliser(fusion.expects, Sensor(keep_own=True))  # the other models label it
+    scans, taxonomy = list_inputs(inputs, options, taxonomy, normaliser)
     scores = []
     for scan in scans:  # raises before anything is written
         scores += [pair.a.find(scan.scores_path), pair.b.find(scan.scores_path)]

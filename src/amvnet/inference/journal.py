@@ -12,7 +12,7 @@ from amvnet.files import atomic_write, remove_unfinished
 
 JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
 UNFINISHED = ".unfinished.jsonl"  # the name of the journal during the run
-KINDS = [str, str, str, int, int, list]  # the types of the values of an `Entry` in JSON
+KINDS = [str, str, str, int, int, list, int]  # the types of the values of an `Entry` in JSON
 
 
 class Entry(NamedTuple):
@@ -24,6 +24,7 @@ class Entry(NamedTuple):
         sensor: the name of the recording, whose scans have one sensor.
         uncertain: the number of uncertain points: `points` times `Segmentation.doubt`.
         counts: the number of points of each train id that was written, from 0.
+        own: the number of points of the car's own body, which are not in `counts`.
     """
 
     scan: str
@@ -32,6 +33,7 @@ class Entry(NamedTuple):
     points: int
     uncertain: int
     counts: list[int]
+    own: int = 0
 
 
 class Journal:

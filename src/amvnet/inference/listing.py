@@ -27,7 +27,9 @@ from amvnet.errors import InputError
 from amvnet.files import inside
 from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
+from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser, normalised
+from amvnet.sensors.own_body import mark_own
 
 
 @dataclass(frozen=True)
@@ -139,10 +141,15 @@ class DatasetScan(InputScan):
         dataset: the dataset.
         record: the scan.
         written: the classes of the labels that are written; by default the classes of the dataset.
+        sensor: marks the points of the car's own body (`mark_own`); without it, none are marked.
     """
 
     def __init__(
-        self, dataset: Dataset, record: ScanRecord, written: Taxonomy | None = None
+        self,
+        dataset: Dataset,
+        record: ScanRecord,
+        written: Taxonomy | None = None,
+        sensor: Sensor | None = None,
     ) -> None:
         scores_path = Path(record.prediction).with_suffix(".npz")
         super().__init__(
@@ -151,6 +158,7 @@ class DatasetScan(InputScan):
         self.dataset = dataset
         self.record = record
         self.written = written
+        self.sensor = sensor
         place = dataset.place_of_labels(record)
         self.corrected = Path(os.path.relpath(place, dataset.root)).as_posix()
 
@@ -161,7 +169,8 @@ class DatasetScan(InputScan):
 
     def load(self, labels: bool = False) -> LoadedScan:
         """Read the scan."""
-        return LoadedScan(self.dataset.read(self.record, labels=labels))
+        scan = self.dataset.read(self.record, labels=labels)
+        return LoadedScan(scan if self.sensor is None else mark_own(scan, self.sensor))
 
     def poses(self, scans: Sequence[InputScan]) -> Poses | None:
         """Return the poses of the dataset, if it has any."""
@@ -303,6 +312,7 @@ def list_inputs(
     taxonomy: Taxonomy | None = None,
     normaliser: Normaliser | None = None,
     written: Taxonomy | None = None,
+    official: bool = False,
 ) -> tuple[list[InputScan], Taxonomy]:
     """List the scans of all inputs, in their order.
 
@@ -315,6 +325,8 @@ def list_inputs(
             of nuScenes, and any other scan file has the classes of SemanticKITTI.
         normaliser: normalises scan files to weights; without it, they stay unchanged.
         written: the classes of the labels that are written; by default the classes above.
+        official: whether labels are written in the official formats of datasets, in which every
+            point has a class, also of the car's own body.
 
     Returns:
         The scans, and the classes of their labels.
@@ -323,6 +335,9 @@ def list_inputs(
         InputError: if an input is missing or has no scan, or the inputs have different classes.
     """
     reader = FileReader(normaliser)
+    sensor = None
+    if normaliser is not None and normaliser.expected is not None and not official:
+        sensor = normaliser.sensor
     scans: list[InputScan] = []
     taxonomies: list[Taxonomy] = []
     for spec in inputs:
@@ -331,7 +346,7 @@ def list_inputs(
             if normaliser is not None:
                 dataset = normalised(dataset, normaliser)
             for record in choose_records(dataset, options.sequences, options.split):
-                scans.append(DatasetScan(dataset, record, written))
+                scans.append(DatasetScan(dataset, record, written, sensor))
             taxonomies.append(dataset.taxonomy)
             continue
 

@@ -32,6 +32,7 @@ def load(
     sensor: str | Mapping[str, Any] | None = None,
     height: float | None = None,
     columns: str | Sequence[str] | None = None,
+    keep_own: bool = False,
     graphs: bool = True,
     report: Reporter = report_nothing,
 ) -> Segmenter:
@@ -61,6 +62,8 @@ def load(
             sensor or a height, arrays are normalised as files are.
         height: the height of the sensor over the ground, metres.
         columns: the names of the columns of arrays and of files of rows, as `Segmenter` takes them.
+        keep_own: label the points of the car's own body as others. By default, they get the id 0.
+            The body of nuScenes' car is known; of others, `own_body` of the sensor tells it.
         graphs: on a GPU, capture the networks as CUDA graphs.
         report: called with a line that names the device, and with a line before long work.
 
@@ -71,12 +74,14 @@ def load(
             be simulated for int8.
     """
     is_described = sensor is not None or height is not None
-    described = make_sensor(sensor, height=height) if is_described else None
+    options = {"height": height, "keep_own": keep_own or None}
+    described = make_sensor(sensor, **options) if is_described else None
     parse_layout(columns)  # before the networks are loaded, which takes long
     compute = Compute(device, engine, precision)
     segmenter = load_with(compute, weights, method, tau, graphs=graphs, report=report)
     segmenter.sensor = described
     segmenter.columns = columns
+    segmenter.keep_own = keep_own
     return segmenter
 
 

@@ -277,8 +277,10 @@ class Pipeline:
         points = int(np.count_nonzero(loaded.scan.valid))
         uncertain = round(result.doubt * points)
         key = _key(scan)
-        counts = np.bincount(result.labels).tolist()
-        return Entry(key, self._origins[key], scan.source, points, uncertain, counts)
+        own = np.zeros(len(result), bool) if loaded.scan.own is None else loaded.scan.own
+        counts = np.bincount(result.labels[~own]).tolist()
+        own_count = int(np.count_nonzero(own))
+        return Entry(key, self._origins[key], scan.source, points, uncertain, counts, own_count)
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:

@@ -61,7 +61,9 @@ def predict(
     classes = request.classes
     normaliser = Normaliser(request.weights.expects, request.sensor, report)
     written = None if classes is None else classes.target
-    scans, _ = list_inputs(inputs, options, request.weights.taxonomy, normaliser, written)
+    scans, _ = list_inputs(
+        inputs, options, request.weights.taxonomy, normaliser, written, official=True
+    )
     check_output(scans, output)
     drives = None
     if drive is not None:

@@ -23,6 +23,7 @@ from amvnet.runtime.memory import return_freed_memory
 from amvnet.scan import AnyArray, Scan, turned
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.own_body import mark_own
 from amvnet.weights.file import Weights
 
 # The least number of points in a batch whose freed memory is returned to the system, because no
@@ -44,6 +45,7 @@ class Segmenter:
         sensor: what is known about the sensor of arrays and files. If it is None, files are
             normalised by what they show, and arrays are taken as they are.
         columns: the names of the columns of arrays and files, as `__call__` takes them.
+        keep_own: whether points of the car's own body get labels as others do, if `sensor` is None.
     """
 
     def __init__(self, weights: Weights, engine: Engine, at_once: int | None = None) -> None:
@@ -52,6 +54,7 @@ class Segmenter:
         self.at_once = engine.at_once if at_once is None else at_once
         self.sensor: Sensor | None = None
         self.columns: str | Sequence[str] | None = None
+        self.keep_own = False
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -161,7 +164,10 @@ class Segmenter:
         """Return the scan of an array, and what was assumed of its sensor if it is described."""
         columns = columns or self.columns
         if self.sensor is None or isinstance(points, Scan):
-            return checked_scan(points, columns, self.weights.expects.intensity), ""
+            scan = checked_scan(points, columns, self.weights.expects.intensity)
+            if not isinstance(points, Scan):
+                scan = mark_own(scan, Sensor(keep_own=self.keep_own))
+            return scan, ""
         normaliser, assumed = self._normaliser()
         scan = normaliser(array_cloud(points, columns), "scan")
         return scan, assumed[0]
@@ -207,7 +213,8 @@ class Segmenter:
     def _normaliser(self) -> tuple[Normaliser, list[str]]:
         """Return a normaliser, and the list of what it assumes of the sensors of the scans."""
         assumed: list[str] = []
-        return Normaliser(self.weights.expects, self.sensor, assumed.append), assumed
+        sensor = self.sensor or Sensor(keep_own=self.keep_own)
+        return Normaliser(self.weights.expects, sensor, assumed.append), assumed
 
     def _segment_input(self, scan: InputScan, assumed: list[str], yaw: float = 0.0) -> Segmentation:
         """Read and segment one of the scans for which a normaliser has `assumed` something."""

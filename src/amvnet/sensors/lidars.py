@@ -6,7 +6,7 @@ import dataclasses
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,10 @@ from amvnet.errors import InputError, did_you_mean, errors_of, shown
 
 # Heights of the sensors over the ground on the cars that recorded KITTI and nuScenes, metres.
 KNOWN_HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
+
+# The cars' own bodies in the frame of their scans: the lowest and the highest x, y, z, metres.
+# KITTI's scans hardly have a point of its car.
+KNOWN_BODIES = {"hdl32e": (-0.71, -1.18, -0.93, 0.71, 2.07, 0.01)}
 
 # The sensors that the built-in weights are trained for, by the name of the weights.
 BUILT_IN = {"sim-hdl32e": "hdl32e", "sim-hdl64e": "hdl64e"}
@@ -33,6 +37,7 @@ AXES = {
 }
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # length of each unit, metres
 Triple = tuple[float, float, float]
+Box = tuple[float, float, float, float, float, float]
 # Beginnings of the names of a maker's LiDARs.
 MAKER_PREFIXES = {
     "velodyne": ("hdl", "vlp", "vls"),
@@ -58,6 +63,9 @@ class Sensor:
         rotate: yaw, pitch and roll, degrees. Applied after `axes`, they turn the scan level and +x
             forward.
         offset: x, y and z, metres. Added after `rotate`, they bring the sensor to the origin.
+        own_body: the lowest x, y, z and the highest x, y, z of the car's own body in the file's
+            axes, metres. Its points get no label.
+        keep_own: whether the points of the car's own body get labels as others do.
 
     Raises:
         InputError: if a value is impossible.
@@ -73,6 +81,8 @@ class Sensor:
     axes: str | None = None
     rotate: Triple | None = None
     offset: Triple | None = None
+    own_body: Box | None = None
+    keep_own: bool = field(default=False, compare=False)  # a wish; it says nothing of the sensor
 
     def __post_init__(self) -> None:
         top = self.fov_up if isinstance(self.fov_up, int | float) else 90
@@ -89,8 +99,13 @@ class Sensor:
         self._check("intensity_scale", is_scale, "a number above 0")
         self._check("unit", self.unit in (None, *UNITS), f"one of {', '.join(UNITS)}")
         self._check("axes", self.axes in (None, *AXES), f"one of {', '.join(AXES)}")
-        self._check("rotate", _is_triple(self.rotate), "yaw,pitch,roll in degrees, as 90,0,0")
-        self._check("offset", _is_triple(self.offset), "x,y,z in metres, as 0,0,1.2")
+        self._check("rotate", _are_numbers(self.rotate, 3), "yaw,pitch,roll in degrees, as 90,0,0")
+        self._check("offset", _are_numbers(self.offset, 3), "x,y,z in metres, as 0,0,1.2")
+        box = self.own_body
+        is_box = _are_numbers(box, 6) and (box is None or all(np.less(box[:3], box[3:])))
+        corners = "the lowest x,y,z and the highest x,y,z in metres, as -1,-1,-1,1,2,0"
+        self._check("own_body", is_box, corners)
+        self._check("keep_own", type(self.keep_own) is bool, "true or false")
 
     def _check(self, key: str, is_valid: bool, expected: str) -> None:
         if not is_valid:
@@ -126,10 +141,11 @@ def _is_within(value: Any, low: float, high: float) -> bool:
     return value is None or (isinstance(value, int | float) and low <= value <= high)
 
 
-def _is_triple(values: Any) -> bool:
+def _are_numbers(values: Any, count: int) -> bool:
+    """Return whether values are unknown, or so many finite numbers."""
     if values is None:
         return True
-    return isinstance(values, tuple) and len(values) == 3 and all(map(math.isfinite, values))
+    return isinstance(values, tuple) and len(values) == count and all(map(math.isfinite, values))
 
 
 def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
@@ -155,8 +171,8 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
     Args:
         sensor: a name in `KNOWN_SENSORS`; attributes of `Sensor`; or a YAML file with such
             attributes. By default the sensor is unknown.
-        options: attributes of `Sensor`, which take precedence unless they are None. `rotate` and
-            `offset` may be texts of three numbers separated by commas.
+        options: attributes of `Sensor`, which take precedence unless they are None. `rotate`,
+            `offset` and `own_body` may be texts of numbers separated by commas.
 
     Raises:
         InputError: if there is no such sensor, file or attribute, or a value is impossible.
@@ -173,8 +189,8 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
             raise InputError(
                 f"expected one of {', '.join(vars(base))}, found {shown(key)}; correct the key"
             )
-    for key in {"rotate", "offset"} & set(changes):
-        changes[key] = _to_triple(changes[key])
+    for key in {"rotate", "offset", "own_body"} & set(changes):
+        changes[key] = _to_numbers(changes[key])
     return dataclasses.replace(base, **changes)
 
 
@@ -210,10 +226,9 @@ def _models_of(text: str) -> list[str]:
     return [name for name in KNOWN_SENSORS if text and name.startswith(beginnings)]
 
 
-def _to_triple(value: Any) -> Any:
-    """Return the three numbers in a list or a text; return anything else unchanged."""
+def _to_numbers(value: Any) -> Any:
+    """Return the numbers in a list or a text as a tuple; return anything else unchanged."""
     try:
-        a, b, c = map(float, value.split(",") if isinstance(value, str) else value)
+        return tuple(map(float, value.split(",") if isinstance(value, str) else value))
     except (TypeError, ValueError, OverflowError):
         return value
-    return a, b, c

@@ -23,6 +23,7 @@ from amvnet.sensors.lasers import SensorGeometry, elevations
 from amvnet.sensors.lidars import (
     BUILT_IN,
     KNOWN_SENSORS,
+    UNITS,
     Sensor,
     make_sensor,
     rotation_from_degrees,
@@ -35,6 +36,7 @@ from amvnet.sensors.measure import (
     raise_points,
     seen_scan,
 )
+from amvnet.sensors.own_body import own_points
 
 MAX_OUTSIDE_SHARE = 0.16  # limit of the share of the points outside a field of view that suffices
 
@@ -46,9 +48,10 @@ def normalise(
 
     The points keep their order and number.
 
-    The scan is levelled and moved to the height of the training's sensor. If the weights' rows are
-    lasers and the scan's lasers are known, the lasers decide `Scan.row`. Otherwise the elevations
-    decide it, under which the sensor saw the points before the move.
+    The scan is levelled and moved to the height of the training's sensor. Points of the car's own
+    body are marked (`own_points`). If the weights' rows are lasers and the scan's lasers are known,
+    the lasers decide `Scan.row`. Otherwise the elevations decide it, under which the sensor saw the
+    points before the move.
 
     Args:
         sensor: what is known about the sensor; it takes precedence over the estimate.
@@ -68,7 +71,8 @@ def normalise(
     row = _rows_by_laser(seen, estimate.frame.complete(sensor), lasers, expected)
     if row is None:
         row = _rows(seen, lasers, expected)
-    return dataclasses.replace(moved, row=row), ring_fault
+    own = own_points(cloud.xyz * UNITS[estimate.frame.unit], cloud.ring, sensor)
+    return dataclasses.replace(moved, row=row, own=own), ring_fault
 
 
 def describe(
@@ -136,7 +140,7 @@ class Normaliser:
         self._report = report
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
-        self._reported: set[str] = set()  # recordings whose line was already reported
+        self._reported: set[str] = set()  # recordings whose line was reported, and such lines
         self._described: list[tuple[str, Estimate]] = []  # notes and estimates in these lines
 
     def quiet(self) -> None:
@@ -207,7 +211,9 @@ class Normaliser:
 
     def for_sensor(self, sensor: Sensor) -> Normaliser:
         """Return a normaliser for the same weights and the scans of a described sensor."""
-        return Normaliser(self.expected, sensor, self._report)
+        keep_own = self.sensor.keep_own or sensor.keep_own
+        described = dataclasses.replace(sensor, keep_own=keep_own)
+        return Normaliser(self.expected, described, self._report)
 
     def target(self) -> SensorGeometry:
         """Return the geometry of a sensor for weights that are trained on the normalised scans.
@@ -244,12 +250,14 @@ class Normaliser:
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
 
         if source not in self._reported:
-            self._reported.add(source)
             has_intensity = cloud.intensity is not None and scale is not None
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
             negative = _describe_negative(cloud)
-            assumed = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
-            self._report(f"{cloud.name}: assumed {', '.join(filter(None, assumed))}")
+            parts = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
+            assumed = ", ".join(filter(None, parts))
+            if assumed not in self._reported:
+                self._report(f"{cloud.name}: assumed {assumed}")
+            self._reported |= {source, assumed}
         return scan
 
 

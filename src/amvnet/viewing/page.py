@@ -210,7 +210,7 @@ def pack(shown: ShownScan) -> Packed:
 
     notes = []
     if left_out:
-        notes.append(f"{left_out:,} without a position or beyond {REACH:g} m")
+        notes.append(f"{left_out:,} without a position, of the car itself or beyond {REACH:g} m")
     if stride > 1:
         notes.append(f"one in {stride} of the scan")
 

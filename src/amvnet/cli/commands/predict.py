@@ -86,7 +86,7 @@ def predict(
         )
 
     if entries:
-        show(labelled_table([entry.counts for entry in entries], request.taxonomy))
+        show(labelled_table(entries, request.taxonomy))
     usual = request.weights.usual_uncertain_at(request.tau)
     report_certainty(entries, request.method, usual, report)
     if request.weights.weakness:

@@ -1,0 +1,57 @@
+"""Find the points of the car's own body in a scan. It needs only NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from amvnet.scan import Scan
+from amvnet.sensors.lasers import SensorGeometry, measure_lasers
+from amvnet.sensors.lidars import KNOWN_BODIES, KNOWN_SENSORS, Box, Sensor
+
+# The least share of a scan's points in the box of a known body that shows this body. The 169 frames
+# of nuScenes that were measured have 18 to 34 % there; a robot with similar lasers has 9 %.
+LEAST_OWN = 0.15
+
+
+def own_points(xyz: np.ndarray, ring: np.ndarray | None, sensor: Sensor) -> np.ndarray | None:
+    """Return (N,) bool: which points are of the car's own body; None if no body is known.
+
+    A known body is found by its lasers and by its many points.
+
+    Args:
+        xyz: (N, 3 or more) the points in the axes of their file, metres.
+        ring: (N,) index of each point's laser, or None if it is unknown.
+        sensor: what is known about the sensor.
+    """
+    if sensor.keep_own:
+        return None
+    if sensor.own_body is not None:
+        return _inside(xyz, sensor.own_body)
+
+    for name, box in KNOWN_BODIES.items():
+        own = _inside(xyz, box)
+        lasers = SensorGeometry().override(KNOWN_SENSORS[name])
+        if own.mean() < LEAST_OWN:
+            continue
+        placed = np.isfinite(xyz[:, :3]).all(axis=1)
+        seen = measure_lasers(xyz[placed], None if ring is None else ring[placed])
+        if seen.is_like(lasers):
+            return own
+    return None
+
+
+def mark_own(scan: Scan, sensor: Sensor) -> Scan:
+    """Return a scan in the axes of its file with `Scan.own`, unless it has that already."""
+    if scan.own is not None:
+        return scan
+    return dataclasses.replace(scan, own=own_points(scan.points, scan.ring, sensor))
+
+
+def _inside(xyz: np.ndarray, box: Box) -> np.ndarray:
+    """Return (N,) bool: which points lie in a box."""
+    inside: np.ndarray = np.ones(len(xyz), dtype=bool)
+    for axis in range(3):
+        inside &= (xyz[:, axis] >= box[axis]) & (xyz[:, axis] <= box[axis + 3])
+    return inside
