@@ -540,7 +540,7 @@ def test_arrays_in_other_units_are_refused_or_normalised_by_the_sensor(
 ) -> None:
     points = in_order()
     scaled = points * np.array([factor, factor, factor, 1])
-    for entry in (by_list, by_fields, by_many):
+    for entry in (by_list, by_fields, by_many, by_runner):
         fails(partial(entry, by_laser, scaled), "expected", "give metres", unit)
 
     expected = by_path(by_laser, points)
