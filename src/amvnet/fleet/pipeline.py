@@ -396,10 +396,16 @@ def connect(address: str | None = None) -> None:
 def _own_signals() -> Iterator[None]:
     """Restore the signal handlers: Ray's handlers would abort the process without a message."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
+    is_stopped = False
+    try:
+        yield
+    except SystemExit:  # by Ray's handler of SIGTERM, while Ray starts
+        is_stopped = True
     if threading.current_thread() is threading.main_thread():
         for number, handler in handlers.items():
             signal.signal(number, handler)
+    if is_stopped:
+        signal.raise_signal(signal.SIGTERM)
 
 
 def share_cluster(cluster: Cluster) -> dict[str, Any]:
