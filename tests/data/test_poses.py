@@ -101,8 +101,9 @@ def test_wrong_tables_of_poses_of_nuscenes_are_one_line(
     rows = json.loads(path.read_text())
     dataset = open_dataset(str(root))
     records = dataset.records(dataset.sequences("all"))
-    for wrong in ([row | {key: value} for row in rows], [{}], []):
-        path.write_text(json.dumps(wrong))
+    wrong: list[list[Any]] = [[row | {key: value} for row in rows], [{}], []]
+    for table_rows in wrong:
+        path.write_text(json.dumps(table_rows))
         fails(lambda: dataset.poses(records), root, "expected the tables")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import yaml
@@ -73,7 +74,7 @@ def test_no_run_begins_in_the_folder_of_a_dataset(tmp_path: Path) -> None:
     data = TrainingData([Source(open_own(tmp_path / "own.yaml"), [])])
     make_semantickitti(tmp_path / "kitti")
     for folder in (tmp_path, tmp_path / "x/..", tmp_path / "kitti"):
-        fails(lambda out=folder: check_folder(Plan(Recipe(), data, out)), folder, "a dataset")
+        fails(partial(check_folder, Plan(Recipe(), data, folder)), folder, "a dataset")
     check_folder(Plan(Recipe(), data, tmp_path / "run"))
 
 

@@ -192,6 +192,13 @@ def with_permuted_rings(folder: Path) -> Case:
     return Case(path, "sim-hdl32e", rows="laser")
 
 
+def with_a_ring_of_a_few_points(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    laser[np.flatnonzero(laser == 0)[:5]] = 31
+    table = with_ring(points, laser)[(laser < 31) | (points[:, 2] < 0)]
+    return Case(write_bin(folder / "few.pcd.bin", table), "sim-hdl32e", rows="ring")
+
+
 def with_random_rings(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
     ring = np.random.default_rng(0).integers(0, 32, len(laser))
@@ -326,6 +333,7 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     of_fewer_lasers,
     with_rings_from_the_highest,
     with_permuted_rings,
+    with_a_ring_of_a_few_points,
     with_random_rings,
     without_rings,
     tilted,

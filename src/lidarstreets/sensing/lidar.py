@@ -67,8 +67,8 @@ def _signals_at_the_end() -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-    for number in waiting:
-        signal.raise_signal(number)
+    for heard in waiting:
+        signal.raise_signal(heard)
 
 
 def take_one_thread() -> None:
