@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
+from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError, errors_of, reason_of
 from amvnet.models.neighbours import nearest_others
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
 from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.frame import check_metres
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.own_body import mark_own
 
@@ -110,8 +112,9 @@ class OnnxSegmenter:
                 range view are rings.
 
         Raises:
-            InputError: if no point is valid; if more than a few intensities are out of range; if
-                the shapes do not fit; or if rings are missing or out of range.
+            InputError: if no point is valid; if an array is clearly not in metres; if more than a
+                few intensities are out of range; if the shapes do not fit; or if rings are missing
+                or out of range.
         """
         if isinstance(points, Scan):
             scan = points
@@ -119,7 +122,10 @@ class OnnxSegmenter:
             ring = None if ring is None else np.asarray(ring)
             with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: not valid
                 table = as_array(points, "points of shape (N, 4)").astype(np.float32)
-            scan = mark_own(check_scan(Scan(table, ring=ring)), Sensor(keep_own=self.keep_own))
+            scan = Scan(table, ring=ring)
+            with errors_of("scan"):
+                check_metres(Cloud(table[:, :3]))
+            scan = mark_own(check_scan(scan), Sensor(keep_own=self.keep_own))
         scan = self.expects.prepare(check_scan(scan))
 
         valid = scan.valid

@@ -231,6 +231,13 @@ def test_nuscenes_tables_that_cannot_be_used(tmp_path: Path) -> None:
     layout = make_nuscenes(tmp_path)
     folder = tmp_path / "v1.0-mini"
 
+    scenes = folder / "scene.json"
+    names = scenes.read_text()
+    for name in ("5", '"../scene-0103"'):
+        scenes.write_text(names.replace('"name": "scene-0103"', f'"name": {name}'))
+        fails(lambda: open_dataset(layout.spec), "expected", name.strip('"'))
+    scenes.write_text(names)
+
     categories = folder / "category.json"
     categories.write_text('[{"token": "a", "name": "a.submarine", "index": 1}]')
     fails(lambda: open_dataset(layout.spec), categories, "a.submarine")
@@ -242,6 +249,10 @@ def test_nuscenes_tables_that_cannot_be_used(tmp_path: Path) -> None:
     fails(lambda: open_dataset(layout.spec), folder)
     categories.write_text("[" * 100_000)
     fails(lambda: open_dataset(layout.spec), categories)
+
+    for text in ('{"name": "vehicle.car"}', '["vehicle.car"]', "5"):
+        categories.write_text(text)
+        fails(lambda: open_dataset(layout.spec), categories, "expected a table")
 
     labels = folder / "lidarseg.json"
     labels.write_text('[{"sample_data_token": "a"}]')

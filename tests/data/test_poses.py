@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,6 +89,22 @@ def test_poses_of_nuscenes_are_those_of_the_car_and_of_its_sensor() -> None:
             turned = moved + 2 * np.cross(axis, np.cross(axis, moved) + w * moved)
             moved = turned + motion["translation"]
         np.testing.assert_allclose(pose[:3, :3] @ point + pose[:3, 3], moved, atol=1e-3)
+
+
+@pytest.mark.parametrize("table", ["ego_pose", "calibrated_sensor"])
+@pytest.mark.parametrize(("key", "value"), [("token", "no such"), ("rotation", ["a"] * 4)])
+def test_wrong_tables_of_poses_of_nuscenes_are_one_line(
+    tmp_path: Path, table: str, key: str, value: Any
+) -> None:
+    root = shutil.copytree(GOLDEN / "nuscenes", tmp_path / "nuscenes")
+    path = root / f"v1.0-mini/{table}.json"
+    rows = json.loads(path.read_text())
+    dataset = open_dataset(str(root))
+    records = dataset.records(dataset.sequences("all"))
+    wrong: list[list[Any]] = [[row | {key: value} for row in rows], [{}], []]
+    for table_rows in wrong:
+        path.write_text(json.dumps(table_rows))
+        fails(lambda: dataset.poses(records), root, "expected the tables")
 
 
 def test_poses_are_interpolated_at_the_times_of_the_scans(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from amvnet.drives.consensus import LEAST, OWN, Consensus, DriveScan, VoxelTable, index_of, keys_of
 
-CLASSES = 4
+CLASSES = 8
 STEP = 1 / 16  # log scores and weights are whole numbers of these steps
 
 
@@ -27,6 +27,7 @@ def random_drive(scans: int, seed: int = 0, count: int = 60) -> list[DriveScan[i
         xyz = (world - pose[:3, 3]) @ pose[:3, :3]
         scores = rng.dirichlet(np.full(CLASSES, 0.3), count)
         scores[rng.random(count) < 0.1] = 0
+        scores[rng.random(count) < 0.1] = 1 / CLASSES  # of the least weight
         drive.append(DriveScan(index, xyz, scores, pose))
     return drive
 

@@ -219,6 +219,19 @@ def test_a_signal_ends_the_run_and_its_workers_with_one_line(
         time.sleep(0.5)  # between two looks
 
 
+def test_a_signal_while_ray_starts_is_not_lost() -> None:
+    """Ray's own handler of SIGTERM exits without a message."""
+    heard: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: heard.append(number))
+    try:
+        with pipeline._own_signals():
+            signal.signal(signal.SIGTERM, lambda number, _: sys.exit(number))
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert heard == [signal.SIGTERM]
+
+
 def start(words: list[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", CLI, *words], stdout=subprocess.DEVNULL)
 

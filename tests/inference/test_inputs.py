@@ -38,6 +38,7 @@ from fixtures.commands import (
     run_cli,
     succeed,
 )
+from fixtures.datasets import make_semantickitti
 from fixtures.marks import with_quick
 from fixtures.sensors import LASERS, place
 from fixtures.tiny import fresh_weights, street
@@ -141,7 +142,7 @@ def said(entries: list[Entry], usual: float = 0.1) -> list[str]:
 
 
 def entry(sensor: str, share: float, points: int = 1000) -> Entry:
-    return Entry(sensor, "", sensor, points, round(share * points), [])
+    return Entry(sensor, "", sensor, points, round(share * points), [], [])
 
 
 def test_each_recording_is_judged_by_its_own_share() -> None:
@@ -161,13 +162,15 @@ def test_one_doubtful_recording_is_one_line() -> None:
     (line,) = said([entry("drive", 0.8)])
     assert line.startswith("warning: do not rely")
     assert line.endswith(ADVICE)
-    assert said([]) == said([Entry("drive", "", "drive", 0, 0, [])]) == []
+    assert said([]) == said([Entry("drive", "", "drive", 0, 0, [], [])]) == []
 
 
 def test_many_doubtful_recordings_are_few_lines() -> None:
     lines = said([entry(str(index), 0.9) for index in range(50)])
     assert len(lines) == 12
     assert "40 other recordings" in lines[-1]
+    lines = said([entry(str(index), 0.9) for index in range(10)])
+    assert lines[-1] == f"warning: {ADVICE}"
 
 
 def test_recordings_of_a_run_are_judged_on_the_command_line(
@@ -325,3 +328,19 @@ def test_an_array_of_another_shape_is_refused(
     array: np.ndarray, columns: str | None, word: str
 ) -> None:
     fails(lambda: array_scan(array, columns), "expected", word)
+
+
+def test_inputs_of_different_classes_are_refused(tmp_path: Path) -> None:
+    kitti = make_semantickitti(tmp_path / "kitti").spec
+    scan = tmp_path / "scan.pcd.bin"  # the ending of nuScenes
+    np.zeros((9, 5), np.float32).tofile(scan)
+    fails(lambda: list_inputs([kitti, str(scan)]), "the same classes")
+
+
+def test_a_scan_that_is_read_again_is_the_file_as_it_is_then(tmp_path: Path) -> None:
+    """A scan that was kept since its sensor was measured is kept no longer than that."""
+    path = write(tmp_path, "a", "os1-64", 1.7)
+    (scan,), _ = list_inputs([str(path)], normaliser=Normaliser(weights_for().expects))
+    assert len(scan.load().scan) > 100
+    np.save(path, np.load(path)[:100])
+    assert len(scan.load().scan) == 100

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import pytest
+
+from amvnet.weights.verdict import EntropyVerdict, Verdict
 from amvnet_ros.health import Health, Labelled, Level
 
 
 def test_clouds_are_counted_and_their_latency_is_measured() -> None:
-    health = Health(usual_uncertain=0.3)
+    health = Health()
     for seconds in (0.2, 0.3, 0.4):
         health.receive(drops=seconds == 0.4)
-        health.label(Labelled(seconds, seconds + 1, points=100, uncertain=0.25))
+        verdict = Verdict(seconds, usual=0.3)
+        health.label(Labelled(seconds, seconds + 1, points=100, verdict=verdict))
 
     report = health.report(2.0)
     assert report.level is Level.OK
@@ -22,16 +26,15 @@ def test_clouds_are_counted_and_their_latency_is_measured() -> None:
         "latency, maximum (ms)": "400",
         "stamp to labels (ms)": "1300",
         "points": "100",
-        "uncertain points (%)": "25.0",
+        "uncertain points (%)": "30.0",
     }
 
 
 def test_counts_go_on_and_measurements_begin_again() -> None:
-    health = Health(usual_uncertain=0.3)
+    health = Health()
     health.receive(drops=True)
-    health.label(Labelled(0.2, 0.2, points=100, uncertain=None))
-    assert "uncertain points (%)" not in health.report(1.0).values
-
+    health.label(Labelled(0.2, 0.2, points=100, verdict=Verdict(0.3, usual=None)))
+    health.report(1.0)
     report = health.report(1.0)
     assert report.level is Level.WARN
     assert "topic" in report.message
@@ -41,13 +44,13 @@ def test_counts_go_on_and_measurements_begin_again() -> None:
 
 
 def test_a_cloud_at_work_is_no_reason_to_warn() -> None:
-    health = Health(usual_uncertain=0.3)
+    health = Health()
     health.receive(drops=False)
     assert health.report(1.0).level is Level.OK
 
 
 def test_a_refused_cloud_is_an_error_with_its_reason() -> None:
-    health = Health(usual_uncertain=0.3)
+    health = Health()
     health.receive(drops=False)
     health.refuse("/points: expected columns x, y, z")
     report = health.report(1.0)
@@ -56,11 +59,12 @@ def test_a_refused_cloud_is_an_error_with_its_reason() -> None:
     assert report.values["clouds refused"] == "1"
 
 
-def test_scans_that_the_weights_do_not_know_are_told() -> None:
-    health = Health(usual_uncertain=0.3)
+@pytest.mark.parametrize("kind", [Verdict, EntropyVerdict])
+def test_scans_that_the_weights_do_not_know_are_told(kind: type[Verdict]) -> None:
+    health = Health()
     health.receive(drops=False)
-    health.label(Labelled(0.2, 0.2, points=100, uncertain=0.7))
+    health.label(Labelled(0.2, 0.2, points=100, verdict=kind(0.7, usual=0.3)))
     report = health.report(1.0)
     assert report.level is Level.WARN
-    assert "70.0%" in report.message
+    assert f"70.0% {kind.quantity}" in report.message
     assert "axes" in report.message

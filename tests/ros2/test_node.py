@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
+import amvnet
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.drives.consensus import REACH, _Seen
 from amvnet.engines.torch import TorchEngine
@@ -158,7 +159,22 @@ def test_a_single_network_has_no_uncertain_points(start: Callable[..., Any]) -> 
     send(node, ros_message(scan(0)))
     published = over_the_wire(node.publishers["~/labels"].messages[-1])
     assert [field.name for field in published.fields] == ["label"]
-    assert "uncertain points (%)" not in {value.key for value in report(node).values}
+
+
+@pytest.mark.parametrize("method", ["amvnet", "rv", "bev"])
+def test_the_diagnostics_have_the_verdict_of_other_entries(
+    start: Callable[..., Any], weights: Path, tmp_path: Path, method: Any
+) -> None:
+    np.save(tmp_path / "scan.npy", scan(0))
+    verdict = amvnet.load(weights, method=method)(tmp_path / "scan.npy").verdict
+    assert verdict is not None
+
+    node = start(method=method)
+    send(node, ros_message(scan(0)))
+    status = report(node)
+    values = {value.key: value.value for value in status.values}
+    assert values[f"{verdict.name} (%)"] == f"{100 * verdict.share:.1f}"
+    assert status.message.startswith(str(verdict) if verdict.is_doubtful else "labelling")
 
 
 def test_a_broken_message_is_reported_and_the_next_one_labelled(start: Callable[..., Any]) -> None:

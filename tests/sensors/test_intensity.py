@@ -22,6 +22,8 @@ from amvnet.sensors.intensity import (
     PROBABILITIES,
     SIMULATED_QUANTILES,
     TrainedIntensity,
+    fill_intensity,
+    intensity_map,
     match_scan,
     matching,
 )
@@ -123,6 +125,29 @@ def test_a_scale_that_the_user_gives_is_all_that_is_done() -> None:
     )
     np.testing.assert_allclose(scan.points[:, 3], 0.04 * points[:, 3], rtol=1e-6)
     assert "0 to 1000" in lines[0]
+
+
+def test_medians_below_one_step_of_8_bits_are_alike() -> None:
+    trained = np.linspace(0, 1, len(PROBABILITIES)) ** 8
+    darker = np.where(trained < 0.004, 0, trained)
+    assert (darker == 0).sum() > len(PROBABILITIES) / 2
+    known = TrainedIntensity(tuple(trained.tolist()))
+    assert intensity_map(darker, 1.0, known).matched is None
+    assert intensity_map(darker / 3, 1.0, known).matched is not None
+
+
+def test_few_missing_intensities_are_judged_without_lost_returns() -> None:
+    """Those of lost returns mean nothing."""
+    points = np.zeros((1000, 4), np.float32)
+    points[:100] = (1, 2, 3, 0.5)
+    points[:20, 3] = np.nan
+    filled, text = fill_intensity(Scan(points), None)
+    assert (filled.points[:100, 3] == 0.5).all()
+    assert "20 %" in text
+
+    points[:60, 3] = np.nan  # most of those that are placed
+    filled, _ = fill_intensity(Scan(points), None)
+    assert (filled.points[:, 3] == 0).all()
 
 
 @pytest.mark.parametrize("intensity", [None, 0.0, 0.15, 255, np.nan])

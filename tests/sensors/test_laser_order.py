@@ -73,6 +73,9 @@ def test_turns_that_do_not_keep_to_an_elevation_are_no_lasers() -> None:
     wild = points.copy()
     wild[:, 2] = np.random.default_rng(0).normal(0, 5, len(points))
     assert lasers_by_order(wild, LASERS) is None
+    steep = points.copy()
+    steep[::2, 2] += 0.2 * np.hypot(points[::2, 0], points[::2, 1])  # of two elevations each
+    assert lasers_by_order(steep, LASERS) is None
     upward = points.reshape(LASERS, SHOTS, 4)[::-1].reshape(-1, 4)  # from the lowest laser
     assert lasers_by_order(upward, LASERS) is None
 
@@ -99,6 +102,9 @@ def test_rings_in_any_order_become_the_lasers(seed: int, tilt: float) -> None:
         scan, fault = order_rings(Scan(points, ring=np.where(unknown, -1, ring)))
         np.testing.assert_array_equal(scan.ring, np.where(unknown, -1, laser))
         assert word in fault
+
+    scan, _ = order_rings(Scan(points, ring=3 * other[laser]))
+    np.testing.assert_array_equal(scan.ring, 3 * laser)
 
     for ring in (laser, np.where(unknown, -1, laser), laser // 2, 3 * laser):
         scan = Scan(points, ring=ring)
@@ -129,6 +135,13 @@ def test_rings_that_do_not_follow_the_elevations_are_left_out() -> None:
 def test_a_few_points_keep_their_rings(count: int) -> None:
     points, laser = turns()
     scan = Scan(points[:count], ring=laser[:count])
+    assert order_rings(scan) == (scan, "")
+
+
+def test_a_ring_of_a_few_points_does_not_change_the_order() -> None:
+    points, laser = turns()
+    laser[-5:] = LASERS  # of the lowest laser
+    scan = Scan(points, ring=laser)
     assert order_rings(scan) == (scan, "")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import yaml
@@ -15,11 +16,13 @@ from amvnet.training.run_folder import (
     MAX_CHANGES,
     SETTINGS,
     check_begun,
+    check_folder,
     describe_changes,
     stage_settings,
 )
 
 from fixtures.commands import fails
+from fixtures.datasets import make_semantickitti
 from fixtures.tiny import fresh_weights
 
 EARLIER = {
@@ -63,6 +66,16 @@ def test_settings_tell_classes_apart_by_names_order_and_ids(tmp_path: Path) -> N
         plan = Plan(Recipe(), TrainingData([first, other]), tmp_path / "run")
         found.add(stage_settings(plan, "rv", fresh_weights())["classes"])
     assert len(found) == 6
+
+
+def test_no_run_begins_in_the_folder_of_a_dataset(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").write_bytes(bytes(160))
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump({"classes": {"a": 1}, "scans": "*.bin"}))
+    data = TrainingData([Source(open_own(tmp_path / "own.yaml"), [])])
+    make_semantickitti(tmp_path / "kitti")
+    for folder in (tmp_path, tmp_path / "x/..", tmp_path / "kitti"):
+        fails(partial(check_folder, Plan(Recipe(), data, folder)), folder, "a dataset")
+    check_folder(Plan(Recipe(), data, tmp_path / "run"))
 
 
 def test_a_refused_resume_says_which_values_differ(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -203,17 +203,47 @@ def with_permuted_rings(folder: Path) -> Case:
     return Case(path, "sim-hdl32e", rows="laser")
 
 
+def with_a_ring_of_a_few_points(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    laser[np.flatnonzero(laser == 0)[:5]] = 31
+    table = with_ring(points, laser)[(laser < 31) | (points[:, 2] < 0)]
+    return Case(write_bin(folder / "few.pcd.bin", table), "sim-hdl32e", rows="ring")
+
+
 def with_random_rings(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
     ring = np.random.default_rng(0).integers(0, 32, len(laser))
     return Case(write_bin(folder / "random.pcd.bin", with_ring(points, ring)), "sim-hdl32e")
 
 
-def tilted_in_order(folder: Path) -> Case:
+def changed(change: Callable[[np.ndarray], np.ndarray], folder: Path) -> Case:
+    """Change the points (N, 4) of the scan like KITTI's."""
     case = kitti_like(folder)
     points = np.fromfile(case.file, np.float32).reshape(-1, 4)
-    points[:, :3] = points[:, :3] @ rotation_from_degrees(0, 14, 0)
-    return Case(write_bin(case.file, points), rows="laser")
+    return Case(write_bin(case.file, change(points)), rows="laser")
+
+
+def tilt(points: np.ndarray) -> np.ndarray:
+    return np.column_stack([points[:, :3] @ rotation_from_degrees(0, 14, 0), points[:, 3]])
+
+
+def gather(points: np.ndarray) -> np.ndarray:
+    """Move every third point to one place."""
+    points[::3, :3] = (3, 1, 0.5)
+    return points
+
+
+CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "tilted_in_order": tilt,
+    "in_reverse": lambda points: points[::-1],
+    "mirrored": lambda points: points * [1, -1, 1, 1],
+    "glued": lambda points: np.concatenate([points, points * [-1, -1, 1, 1]]),
+    "coincident": gather,
+    "of_12_bits": lambda points: np.column_stack([points[:, :3], points[:, 3] * 4095 // 1]),
+    "of_1_point": lambda points: points[:1],
+    "of_2_points": lambda points: points[:2],
+    "of_16_points": lambda points: points[:16],
+}
 
 
 def without_rings(folder: Path) -> Case:
@@ -316,10 +346,10 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     of_fewer_lasers,
     with_rings_from_the_highest,
     with_permuted_rings,
+    with_a_ring_of_a_few_points,
     with_random_rings,
     without_rings,
     tilted,
-    tilted_in_order,
     with_y_up_in_millimetres,
     on_the_ground,
     on_a_mound,
@@ -334,6 +364,7 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
 
 
 MAKERS = {make.__name__: make for make in SCANS}
+MAKERS |= {name: partial(changed, change) for name, change in CHANGES.items()}
 WITH_VIEWS = ("kitti_like", "nuscenes_like", "higher_with_lost_returns")
 Made = tuple[Case, dict[str, Any]]  # a scan, and what the page makes of it
 

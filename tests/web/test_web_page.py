@@ -43,6 +43,7 @@ NODE = shutil.which("node")
 TIMEOUT = 1500  # seconds: a safety net; no outcome depends on it
 MEGABYTE = 1_000_000
 AGREEMENT = 0.999  # least share of the points with the labels of `onnx_runner.py`
+HOSTILE = "<img src=x onerror=alert(1)>&amp;'\"%2e#?"  # a name that must stay a name
 OWN = "mine"  # the folder of own weights beside the page
 # With these headers, a browser may run threads.
 ISOLATION = {
@@ -169,9 +170,9 @@ def scan_files(folder: Path) -> dict[str, Path]:
     points, _ = place(LASERS["os1-64"], 1.9, steps=500)
     pcd = write_pcd(folder / "cloud.pcd", points, "binary_compressed")
     points, _ = place(np.linspace(-23.9, 3, 16), 1.73, steps=250)
-    own = folder / "own.bin"
+    own = folder / f"{HOSTILE}.bin"
     own.write_bytes(points.astype(np.float32).tobytes())
-    broken = folder / "broken.pcd"
+    broken = folder / f"{HOSTILE}.pcd"
     broken.write_bytes(pcd.read_bytes()[:-500])
     return {"kitti": kitti, "nuscenes": nuscenes, "pcd": pcd, "own": own, "broken": broken}
 
@@ -305,8 +306,14 @@ def test_the_viewer_draws_every_point_with_its_label(session: Session) -> None:
 def test_a_broken_file_gives_its_line(session: Session) -> None:
     result = session.results["broken"]
     assert result["state"] == "failed"
-    assert result["problem"].startswith("broken.pcd: expected at least ")
+    assert result["problem"].startswith(f"{HOSTILE}.pcd: expected at least ")
     assert result["problem"].endswith("the file is truncated, copy it again")
+
+
+def test_hostile_names_of_files_stay_names(session: Session) -> None:
+    result = session.results["own"]
+    assert result["assumed"].startswith(f"{HOSTILE}.bin: assumed")
+    assert session.report["console"] == []  # an image that is missing would be an error there
 
 
 def test_only_one_of_several_dropped_files_can_be_labelled(session: Session) -> None:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from statistics import median
 from threading import Lock
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the node sets the environment before torch reads it
+    from amvnet.weights.verdict import Verdict
 
 
 class Level(Enum):
@@ -33,14 +37,13 @@ class Labelled:
         seconds: the seconds from the arrival of the cloud to its labels.
         age: the seconds from the stamp of the cloud to its labels.
         points: the number of points.
-        uncertain: the share of points on which the networks disagree, in [0, 1]; None for a single
-            network.
+        verdict: how sure the labels are.
     """
 
     seconds: float
     age: float
     points: int
-    uncertain: float | None
+    verdict: Verdict
 
 
 @dataclass
@@ -54,15 +57,9 @@ class _Period:
 
 
 class Health:
-    """Counts what happens to the clouds; any thread may call it.
+    """Counts what happens to the clouds; any thread may call it."""
 
-    Args:
-        usual_uncertain: the share of uncertain points in the scans that the weights were validated
-            on, in [0, 1].
-    """
-
-    def __init__(self, usual_uncertain: float) -> None:
-        self._usual_uncertain = usual_uncertain
+    def __init__(self) -> None:
         self._lock = Lock()
         self._period = _Period()
         self._received = 0
@@ -107,7 +104,7 @@ class Health:
                 "clouds refused": str(self._refused),
             }
         values |= _describe(period, seconds)
-        return Report(*_judge(period, self._usual_uncertain), values)
+        return Report(*_judge(period), values)
 
 
 def _describe(period: _Period, seconds: float) -> dict[str, str]:
@@ -124,31 +121,26 @@ def _describe(period: _Period, seconds: float) -> dict[str, str]:
     values["latency, maximum (ms)"] = f"{max(latencies):.0f}"
     values["stamp to labels (ms)"] = f"{median(ages):.0f}"
     values["points"] = f"{median(cloud.points for cloud in labelled):.0f}"
-    uncertain = _uncertain(period)
-    if uncertain is not None:
-        values["uncertain points (%)"] = f"{100 * uncertain:.1f}"
+    verdict = _verdict(labelled)
+    values[f"{verdict.name} (%)"] = f"{100 * verdict.share:.1f}"
     return values
 
 
-def _judge(period: _Period, usual_uncertain: float) -> tuple[Level, str]:
+def _judge(period: _Period) -> tuple[Level, str]:
     """Return the level and the message of the report on a period."""
     if period.refusal:
         return Level.ERROR, period.refusal
     if not period.received and not period.labelled:
         return Level.WARN, "no clouds: check the topic, and its QoS"
 
-    uncertain = _uncertain(period)
-    if uncertain is not None:
-        # Imported late: the node sets the environment before torch reads it.
-        from amvnet.weights.verdict import Verdict
-
-        verdict = Verdict(uncertain, usual_uncertain)
+    if period.labelled:
+        verdict = _verdict(period.labelled)
         if verdict.is_doubtful:
             return Level.WARN, f"{verdict}; check sensor, height, unit, axes and intensity_scale"
     return Level.OK, "labelling"
 
 
-def _uncertain(period: _Period) -> float | None:
-    """Return the median share of uncertain points; None if it is not known."""
-    shares = [cloud.uncertain for cloud in period.labelled if cloud.uncertain is not None]
-    return median(shares) if shares else None
+def _verdict(labelled: list[Labelled]) -> Verdict:
+    """Return the verdict on the median cloud."""
+    share = median(cloud.verdict.share for cloud in labelled)
+    return replace(labelled[0].verdict, share=share)

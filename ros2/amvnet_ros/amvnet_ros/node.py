@@ -81,7 +81,7 @@ class SegmentNode(Node):
             find_pose = self._find_pose
         self._segment = CloudSegmenter(settings, topic, self.get_logger().info, find_pose)
         self._hardware = self._segment.hardware
-        self._health = Health(self._segment.usual_uncertain)
+        self._health = Health()
         self._report_time = time.monotonic()
 
         self._label_publisher = self._create_cloud_publisher("~/labels")
@@ -146,7 +146,7 @@ class SegmentNode(Node):
                 seconds=time.monotonic() - arrival.time,
                 age=age / NANOSECONDS,
                 points=len(labelled.points.raw),
-                uncertain=labelled.uncertain_share,
+                verdict=labelled.verdict,
             )
         )
 

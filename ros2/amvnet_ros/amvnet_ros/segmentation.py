@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from amvnet.data.formats.cloud import reading
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet_ros.fusion import FindPose, PastFusion
 from amvnet_ros.messages import LabelledPoints, Message
+
+if TYPE_CHECKING:  # the node sets the environment before torch reads it
+    from amvnet.weights.verdict import Verdict
 
 
 def _parameter(default: Any, description: str) -> Any:
@@ -65,13 +68,12 @@ class LabelledCloud:
     Attributes:
         origin: the parts of the message that its labels keep.
         points: the points with raw ids, 0 for lost points, and class colours.
-        uncertain_share: the share of uncertain points among all points that are not lost, in
-            [0, 1]; None for a single network.
+        verdict: how sure the labels are.
     """
 
     origin: Message
     points: LabelledPoints
-    uncertain_share: float | None
+    verdict: Verdict
 
 
 class CloudSegmenter:
@@ -84,8 +86,6 @@ class CloudSegmenter:
     Attributes:
         taxonomy: the classes.
         hardware: the device that computes, in words.
-        usual_uncertain: the share of uncertain points in the scans that the weights were validated
-            on, in [0, 1].
 
     Args:
         settings: the parameters of the node.
@@ -127,7 +127,6 @@ class CloudSegmenter:
             keep_freed_memory()
         self.taxonomy = segmenter.taxonomy
         self.hardware = segmenter.engine.hardware
-        self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
         self._normalise = Normaliser(segmenter.weights.expects, sensor, report)
         self._segment = segmenter
@@ -148,14 +147,14 @@ class CloudSegmenter:
         result = self._segment(scan, yaw=0.0 if self._fuse is None else self._fuse.yaw(origin))
         if self._fuse is not None:  # last, because odometry often comes after its scan
             result = self._fuse(origin, cloud.xyz, result)
-        verdict = result.verdict if result.has_two_networks else None
         points = LabelledPoints(
             cloud.xyz,
             raw=self.taxonomy.to_raw(result.labels),
             colors=self._colors[result.labels],
-            uncertain=None if verdict is None else result.uncertain,
+            uncertain=result.uncertain if result.has_two_networks else None,
         )
-        return LabelledCloud(origin, points, None if verdict is None else verdict.share)
+        assert result.verdict is not None  # a segmenter labelled the scan
+        return LabelledCloud(origin, points, result.verdict)
 
     def classes(self) -> str:
         """Return the classes as JSON: id (as in the field label), name and color (RGB) of each."""

@@ -328,7 +328,7 @@ class FleetRun:
                     faults.append(row["error"] or f"{lost}label it again with --resume")
 
         usual = self.request.weights.usual_uncertain_at(self.request.tau)
-        drives = [Entry("", "", drive, points[drive], uncertain[drive], []) for drive in points]
+        drives = [Entry("", "", drive, points[drive], uncertain[drive], [], []) for drive in points]
         report_certainty(drives, self.request.method, usual, self._report)
         check_faults(faults, len(self._names))
         return written
@@ -396,10 +396,16 @@ def connect(address: str | None = None) -> None:
 def _own_signals() -> Iterator[None]:
     """Restore the signal handlers: Ray's handlers would abort the process without a message."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
+    is_stopped = False
+    try:
+        yield
+    except SystemExit:  # by Ray's handler of SIGTERM, while Ray starts
+        is_stopped = True
     if threading.current_thread() is threading.main_thread():
         for number, handler in handlers.items():
             signal.signal(number, handler)
+    if is_stopped:
+        signal.raise_signal(signal.SIGTERM)
 
 
 def share_cluster(cluster: Cluster) -> dict[str, Any]:

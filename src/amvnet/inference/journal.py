@@ -12,7 +12,7 @@ from amvnet.files import atomic_write, remove_unfinished
 
 JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
 UNFINISHED = ".unfinished.jsonl"  # the name of the journal during the run
-KINDS = [str, str, str, int, int, list, int]  # the types of the values of an `Entry` in JSON
+KINDS = [str, str, str, int, int, list, list, int]  # the types of the values in JSON
 
 
 class Entry(NamedTuple):
@@ -24,6 +24,7 @@ class Entry(NamedTuple):
         sensor: the name of the recording, whose scans have one sensor.
         uncertain: the number of uncertain points: `points` times `Segmentation.doubt`.
         counts: the number of points of each train id that was written, from 0.
+        sizes: the size of each file that was written, bytes.
         own: the number of points of the car's own body, which are not in `counts`.
     """
 
@@ -33,7 +34,17 @@ class Entry(NamedTuple):
     points: int
     uncertain: int
     counts: list[int]
+    sizes: list[int]
     own: int = 0
+
+    @classmethod
+    def from_json(cls, values: Any) -> Entry | None:
+        """Return the entry that a line of a journal holds; None if it holds anything else."""
+        if not isinstance(values, list) or list(map(type, values)) != KINDS:
+            return None
+        entry = cls(*values)
+        numbers = [entry.points, entry.uncertain, entry.own, *entry.counts, *entry.sizes]
+        return entry if all(type(number) is int and number >= 0 for number in numbers) else None
 
 
 class Journal:
@@ -139,11 +150,7 @@ def _read(path: Path) -> tuple[dict[str, Any], list[Entry]]:
     if not isinstance(settings, dict):
         settings = {}
 
-    entries = []
-    for line in lines[1:]:
-        values = _from_line(line)
-        if isinstance(values, list) and list(map(type, values)) == KINDS:
-            entries.append(Entry(*values))
+    entries = [entry for line in lines[1:] if (entry := Entry.from_json(_from_line(line)))]
     return settings, entries
 
 

@@ -55,8 +55,8 @@ def lasers_by_order(points: np.ndarray, lasers: int) -> np.ndarray | None:
         return None
 
     ring = np.repeat(np.arange(lasers - 1, -1, -1), sizes)
-    # A lost return has the laser of the point before it.
-    return ring if is_known.all() else ring[np.maximum(np.cumsum(is_known) - 1, 0)]
+    # A lost return has the laser of the point before it; before the first point, it has any laser.
+    return ring if is_known.all() else ring[np.cumsum(is_known) - 1]
 
 
 def order_rings(scan: Scan) -> tuple[Scan, str]:

@@ -35,6 +35,7 @@ class Verdict:
     share: float
     usual: float | None
     unusual_odds: ClassVar[float] = UNUSUAL_ODDS
+    name: ClassVar[str] = "uncertain points"
     quantity: ClassVar[str] = "of the points are uncertain"
 
     @classmethod
@@ -74,4 +75,5 @@ class EntropyVerdict(Verdict):
     """The verdict on the labels of a single network, whose shares are mean entropies."""
 
     unusual_odds = UNUSUAL_ENTROPY_ODDS
+    name = "mean entropy"
     quantity = "is the mean entropy of the network"

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from types import ModuleType
@@ -38,14 +41,34 @@ def require_embree() -> tuple[ModuleType, ModuleType]:
         SimulationError: if the extra `simulate` is not installed.
     """
     try:
-        import trimesh  # noqa: F401  makes the spheres of the foliage
-        from embreex import mesh_construction, rtcore_scene
+        with _signals_at_the_end():
+            import trimesh.creation  # noqa: F401  makes the spheres of the foliage
+            from embreex import mesh_construction, rtcore_scene
     except ImportError as error:
         raise SimulationError(
             "simulation: expected trimesh and embreex to cast rays, found at least one missing; "
             'run pip install "amvnet[simulate]"'
         ) from error
     return rtcore_scene, mesh_construction
+
+
+@contextmanager
+def _signals_at_the_end() -> Iterator[None]:
+    """Let SIGINT and SIGTERM wait: trimesh drops all exceptions while it is imported."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting: list[int] = []
+    handlers = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        handlers[number] = signal.signal(number, lambda number, _: waiting.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for heard in waiting:
+        signal.raise_signal(heard)
 
 
 def take_one_thread() -> None:

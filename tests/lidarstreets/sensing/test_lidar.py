@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +16,7 @@ from lidarstreets.sensing.sensors import LidarModel
 from lidarstreets.solids import box, hull
 
 from fixtures.examples import first_of
+from fixtures.processes import PATIENCE
 
 pytest.importorskip("embreex")
 from lidarstreets.sensing import lidar
@@ -483,3 +486,30 @@ def test_the_car_itself_returns_a_few_dark_points_in_firing_order() -> None:
     assert (np.diff(ring.astype(int)) <= 0).all()
     azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
     assert (np.diff(azimuth)[np.diff(ring) == 0] > -0.1).all()
+
+
+INTERRUPTED = """
+import signal, sys
+from importlib.abc import MetaPathFinder
+from lidarstreets.sensing.lidar import require_embree
+
+class Finder(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name == "trimesh.voxel":
+            signal.raise_signal(signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Finder())
+try:
+    require_embree()
+except KeyboardInterrupt:
+    print("stopped")
+"""
+
+
+@pytest.mark.full
+def test_a_signal_during_the_import_of_trimesh_is_not_lost() -> None:
+    """Trimesh drops the exceptions of its imports."""
+    words = [sys.executable, "-c", INTERRUPTED]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE)
+    assert (done.returncode, done.stdout) == (0, "stopped\n"), done.stderr

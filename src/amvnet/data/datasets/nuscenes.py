@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows
 from amvnet.data.labels.ids import read_ids
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
-from amvnet.errors import InputError, shown
+from amvnet.errors import InputError, one_line_errors, reason_of, shown
 from amvnet.files import checked_token
 from amvnet.scan import Scan
 
@@ -71,16 +72,11 @@ class NuScenes(Dataset):
         super().__init__(root, NUSCENES)
         self.version = self._find_version(version)
 
-        try:
+        with self._using_tables():
             label_rows = self._table("lidarseg", required=False)
             self._label_files = _lookup(label_rows, "sample_data_token", "filename")
             self._category_train_ids = self._category_lookup() if label_rows else None
             self._records_by_scene = self._read_records()
-        except (KeyError, TypeError, IndexError) as error:
-            raise InputError(
-                f"{self.root / self.version}: expected the tables of nuScenes, "
-                f"found no entry {error}; unpack them"
-            ) from None
 
     @staticmethod
     def matches(root: Path) -> bool:
@@ -187,31 +183,26 @@ class NuScenes(Dataset):
 
     def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
         """Return the poses of the LiDAR, from the tables of the car's poses and of its sensors."""
-        ego = self._motions("ego_pose")
-        sensor = self._motions("calibrated_sensor")
-        rows = {row["token"]: row for row in filter(_is_scan, self._table("sample_data"))}
-        poses = []
-        for record in records:
-            row = rows[record.name]
-            poses.append(ego[row["ego_pose_token"]] @ sensor[row["calibrated_sensor_token"]])
-        return np.array(poses)
+        with self._using_tables():
+            ego = self._motions("ego_pose")
+            sensor = self._motions("calibrated_sensor")
+            rows = {row["token"]: row for row in filter(_is_scan, self._table("sample_data"))}
+            poses = []
+            for record in records:
+                row = rows[record.name]
+                poses.append(ego[row["ego_pose_token"]] @ sensor[row["calibrated_sensor_token"]])
+            return np.array(poses)
 
     def _motions(self, table: str) -> dict[str, Poses]:
         """Return the (4, 4) motions of a table by their tokens."""
         from scipy.spatial.transform import Rotation
 
         rows = self._table(table)
-        try:
-            motions = np.tile(np.eye(4), (len(rows), 1, 1))
-            motions[:, :3, 3] = [row["translation"] for row in rows]
-            quaternions = [row["rotation"] for row in rows]  # w x y z
-            motions[:, :3, :3] = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
-            return dict(zip([row["token"] for row in rows], motions, strict=True))
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{self.root / self.version / table}.json: expected translations and rotations, "
-                f"found another table ({error}); unpack it again"
-            ) from None
+        motions = np.tile(np.eye(4), (len(rows), 1, 1))
+        motions[:, :3, 3] = [row["translation"] for row in rows]
+        quaternions = [row["rotation"] for row in rows]  # w x y z
+        motions[:, :3, :3] = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+        return dict(zip([row["token"] for row in rows], motions, strict=True))
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""
@@ -252,6 +243,17 @@ class NuScenes(Dataset):
             f"{self.root}: expected {expected}, found {', '.join(present) or 'none'}; {advice}"
         )
 
+    def _using_tables(self) -> AbstractContextManager[None]:
+        """Turn the errors of rows that lack an entry, or have another one, into an InputError."""
+
+        def message(error: BaseException) -> str:
+            return (
+                f"{self.root / self.version}: expected the tables of nuScenes, "
+                f"found no entry {reason_of(error)[:100]}; unpack them"
+            )
+
+        return one_line_errors(message, only=(KeyError, TypeError, IndexError, ValueError))
+
     def _table(self, name: str, required: bool = True) -> list[Row]:
         """Read one table; return no rows if an optional table is missing."""
         path = self.root / self.version / f"{name}.json"
@@ -264,12 +266,13 @@ class NuScenes(Dataset):
             )
 
         try:
-            rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))
+            rows = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+                raise ValueError(shown(rows))
         except (ValueError, RecursionError) as error:
             raise InputError(
                 f"{path}: expected a table in JSON, found {error}; unpack the file again"
             ) from None
-
         return rows
 
     def _category_lookup(self) -> np.ndarray:
@@ -307,7 +310,7 @@ class NuScenes(Dataset):
         scene_names = _lookup(self._table("scene"), "token", "name")
         scene_of_sample = {}
         for row in self._table("sample"):
-            scene_of_sample[row["token"]] = scene_names[row["scene_token"]]
+            scene_of_sample[row["token"]] = checked_token(scene_names[row["scene_token"]])
 
         rows = list(filter(_is_scan, self._table("sample_data")))
         rows.sort(key=lambda row: (row["timestamp"], row["token"]))
