@@ -142,7 +142,7 @@ def said(entries: list[Entry], usual: float = 0.1) -> list[str]:
 
 
 def entry(sensor: str, share: float, points: int = 1000) -> Entry:
-    return Entry(sensor, "", sensor, points, round(share * points), [], [])
+    return Entry(sensor, "", sensor, points, round(share * points), [])
 
 
 def test_each_recording_is_judged_by_its_own_share() -> None:
@@ -162,7 +162,7 @@ def test_one_doubtful_recording_is_one_line() -> None:
     (line,) = said([entry("drive", 0.8)])
     assert line.startswith("warning: do not rely")
     assert line.endswith(ADVICE)
-    assert said([]) == said([Entry("drive", "", "drive", 0, 0, [], [])]) == []
+    assert said([]) == said([Entry("drive", "", "drive", 0, 0, [])]) == []
 
 
 def test_many_doubtful_recordings_are_few_lines() -> None:

@@ -328,7 +328,7 @@ class FleetRun:
                     faults.append(row["error"] or f"{lost}label it again with --resume")
 
         usual = self.request.weights.usual_uncertain_at(self.request.tau)
-        drives = [Entry("", "", drive, points[drive], uncertain[drive], [], []) for drive in points]
+        drives = [Entry("", "", drive, points[drive], uncertain[drive], []) for drive in points]
         report_certainty(drives, self.request.method, usual, self._report)
         check_faults(faults, len(self._names))
         return written

@@ -12,7 +12,7 @@ from amvnet.files import atomic_write, remove_unfinished
 
 JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
 UNFINISHED = ".unfinished.jsonl"  # the name of the journal during the run
-KINDS = [str, str, str, int, int, list, list, int]  # the types of the values in JSON
+KINDS = [str, str, str, int, int, list, int]  # the types of the values in JSON
 
 
 class Entry(NamedTuple):
@@ -24,7 +24,6 @@ class Entry(NamedTuple):
         sensor: the name of the recording, whose scans have one sensor.
         uncertain: the number of uncertain points: `points` times `Segmentation.doubt`.
         counts: the number of points of each train id that was written, from 0.
-        sizes: the size of each file that was written, bytes.
         own: the number of points of the car's own body, which are not in `counts`.
     """
 
@@ -34,7 +33,6 @@ class Entry(NamedTuple):
     points: int
     uncertain: int
     counts: list[int]
-    sizes: list[int]
     own: int = 0
 
     @classmethod
@@ -43,7 +41,7 @@ class Entry(NamedTuple):
         if not isinstance(values, list) or list(map(type, values)) != KINDS:
             return None
         entry = cls(*values)
-        numbers = [entry.points, entry.uncertain, entry.own, *entry.counts, *entry.sizes]
+        numbers = [entry.points, entry.uncertain, entry.own, *entry.counts]
         return entry if all(type(number) is int and number >= 0 for number in numbers) else None
 
 

@@ -167,17 +167,13 @@ class Pipeline:
         return kept
 
     def _is_done(self, scan: InputScan, entry: Entry) -> bool:
-        """Return whether the files of a scan of an earlier run are whole and still right.
+        """Return whether the files of a scan of an earlier run exist and are still right.
 
         The scan has not changed, nor have the first scans of its recording, which decide how it is
         normalised.
         """
-        return entry.origin == self._origins[entry.scan] and entry.sizes == self._sizes(scan)
-
-    def _sizes(self, scan: InputScan) -> list[int]:
-        """Return the size of each file that is written for a scan, bytes; 0 if it is missing."""
-        paths = self.output.files_of(scan)
-        return [_size_and_time(self.output.folder / path)[0] for path in paths]
+        paths = [self.output.folder / path for path in self.output.files_of(scan)]
+        return entry.origin == self._origins[entry.scan] and all(map(Path.is_file, paths))
 
     @cached_property
     def _origins(self) -> dict[str, str]:
@@ -283,7 +279,7 @@ class Pipeline:
         key = _key(scan)
         own = np.zeros(len(result), bool) if loaded.scan.own is None else loaded.scan.own
         counts = np.bincount(result.labels[~own]).tolist()
-        values = key, self._origins[key], scan.source, points, uncertain, counts, self._sizes(scan)
+        values = key, self._origins[key], scan.source, points, uncertain, counts
         return Entry(*values, int(np.count_nonzero(own)))
 
 

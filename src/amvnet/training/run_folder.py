@@ -18,7 +18,6 @@ from amvnet.config.nested import flat, to_dict
 from amvnet.config.yaml_files import parse_yaml
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.open import is_dataset
-from amvnet.data.datasets.own import OwnScans
 from amvnet.data.datasets.training_data import TrainingData
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, remove_unfinished
@@ -74,8 +73,7 @@ def check_folder(plan: Plan) -> None:
     check_not_read([plan.out / name for name in names], plan.also_read)
     if is_run(plan.out):
         return
-    own = [source.dataset for source in plan.data.sources]
-    roots = [dataset.root.resolve() for dataset in own if isinstance(dataset, OwnScans)]
+    roots = [source.dataset.root.resolve() for source in plan.data.sources]
     if is_dataset(str(plan.out)) or plan.out.resolve() in roots:
         raise InputError(
             f"{plan.out}: expected a new folder or the folder of a run, found a dataset; give "
