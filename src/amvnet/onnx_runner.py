@@ -258,7 +258,7 @@ def scores_of_points(
     distance: np.ndarray,
     scores: np.ndarray,
 ) -> np.ndarray:
-    """Return the (P, K) scores of points from those of pixels, as `RangeImage.to_points` does.
+    """Return the (P, K) scores of points, given scores of pixels, as `RangeImage.to_points` does.
 
     `image` and `pixel` are what `range_image` returns; `distance` (P,) is in metres, and `scores`
     are (H * W, K) probabilities.

@@ -61,7 +61,7 @@ function validPoints(xyz, intensity, name) {
 }
 
 /**
- * Return {points, rows, places} of n points without those of the car's own body, if the scan shows a body that is known:
+ * Return {points, rows, places} of the points outside the car's own body, if the scan shows a body that is known:
  * nuScenes' car, which has many points of every scan.
  */
 function withoutOwn(points, rows, places, { xyz, lasers, unit }) {

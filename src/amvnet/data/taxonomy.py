@@ -212,7 +212,7 @@ def check_classes(source: str, of_data: Taxonomy, of_weights: Taxonomy) -> None:
 
 
 def describe_difference(classes: Sequence[str], others: Sequence[str], of_others: str) -> str:
-    """Describe how the names of classes differ from those of others, such as "the weights"."""
+    """Describe how names of classes differ from the names of others, such as "the weights"."""
     missing = [name for name in classes if name not in others]
     added = [name for name in others if name not in classes]
     texts = []

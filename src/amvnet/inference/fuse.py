@@ -156,7 +156,7 @@ def fuse_files(
 
     Args:
         inputs: the scans, as `list_inputs` takes them.
-        head, tau: as for `fuse`; the head is that of weights.
+        head, tau: as for `fuse`; `head` is weights that have a point head.
         taxonomy: the classes if there is no head; by default the classes of the inputs.
 
     Raises:

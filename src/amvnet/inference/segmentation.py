@@ -252,7 +252,7 @@ def fetch(scores: Scores) -> tuple[Tensor, Scores]:
 def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> Segmentation:
     """Return the result for one scan of a batch.
 
-    Of its points, `valid` (N,), the valid ones have the places `points` in the batch.
+    `valid` (N,) says which points of the scan are valid; these are `points` of the batch.
     """
     return Segmentation(
         labels=expand_to_scan(labels[points], valid),

@@ -79,7 +79,7 @@ class PolarNet(nn.Module):
 class DropBlock(nn.Module):
     """Drop squares of `size` cells in training, and scale up the others (Ghiasi et al., 2018).
 
-    `probability` is that of a cell to be dropped.
+    Each cell is dropped with `probability`.
     """
 
     def __init__(self, probability: float, size: int) -> None:

@@ -63,8 +63,8 @@ Loaders = tuple[DataLoader[Any], DataLoader[Any] | None]
 class Stage(L.LightningModule):
     """The base class of all stages: it computes the metrics of the validation, and the schedule.
 
-    `config` has the values of the stage in the recipe; `precision` is that of the forward and
-    backward passes.
+    `config` has the values of the stage in the recipe. The forward and backward passes compute in
+    `precision`.
     """
 
     name: str  # the value of --stage
