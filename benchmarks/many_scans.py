@@ -1,6 +1,7 @@
 """Measure how many scans a second `predict` segments, next to the two networks alone.
 
-    python benchmarks/many_scans.py FOLDER [--engines torch,int8] [--at-once 1,2] [--rounds N]
+    python benchmarks/many_scans.py FOLDER [--weights NAME] [--engines torch,int8]
+        [--at-once 1,2] [--taus 0.5,0.85] [--rounds N]
 
 FOLDER holds ten scan files or more, such as *.bin. The rate of `predict` is the rate at which label
 files appear, without the first few, so that the start of the program does not count.
@@ -27,46 +28,49 @@ from amvnet import read as read_scan
 from amvnet.inference.scan_stream import stream_scans
 
 WARM_UP = 4  # number of scans that do not count
-WEIGHTS = "sim-hdl64e"
 SLEEPING = {**os.environ, "OMP_WAIT_POLICY": "passive"}  # the environment of commands
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--weights", default="sim-hdl64e")
     parser.add_argument("--engines", default="torch,int8")
     parser.add_argument("--at-once", default="1,2")
+    parser.add_argument("--taus", default="0.85")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--networks", action="store_true")  # in this process, for `networks_rate`
     options = parser.parse_args()
 
     paths = sorted(path for path in options.folder.iterdir() if path.is_file())
     if options.networks:
-        print(json.dumps(time_networks(paths, options.engines, int(options.at_once))))
+        print(json.dumps(time_networks(options, paths)))
         return
 
-    variants = list(product(options.engines.split(","), map(int, options.at_once.split(","))))
-    rows: defaultdict[tuple[str, int], list[tuple[float, float, int]]] = defaultdict(list)
+    lists = (options.engines.split(","), options.at_once.split(","), options.taus.split(","))
+    rows: defaultdict[tuple[str, ...], list[tuple[float, float, int]]] = defaultdict(list)
     for _ in range(options.rounds):
-        for engine, at_once in variants:
-            networks = networks_rate(options.folder, engine, at_once)
-            rows[engine, at_once].append((networks, *predict_rate(options.folder, engine, at_once)))
+        for engine, at_once in product(*lists[:2]):
+            common = [str(options.folder), "--weights", options.weights, "--at-once", at_once]
+            networks = networks_rate([*common, "--engines", engine])
+            for tau in lists[2]:
+                predict = predict_rate([*common, "--engine", engine, "--tau", tau])
+                rows[engine, at_once, tau].append((networks, *predict))
 
     print(f"{len(paths)} scans; scans per second, medians of {options.rounds} rounds\n")
-    print("| engine | at once | networks alone | predict | share | peak memory, MiB |")
-    print("|---|---|---|---|---|---|")
-    for (engine, at_once), rounds in rows.items():
+    print("| engine | at once | tau | networks alone | predict | share | peak memory, MiB |")
+    print("|---|---|---|---|---|---|---|")
+    for variant, rounds in rows.items():
         networks, predict, memory = np.median(rounds, axis=0)
         share = np.median([row[1] / row[0] for row in rounds])
         cells = f"{networks:.1f} | {predict:.1f} | {share:.2f} | {memory:.0f}"
-        print(f"| {engine} | {at_once} | {cells} |")
+        print(f"| {' | '.join(variant)} | {cells} |")
 
 
-def predict_rate(folder: Path, engine: str, at_once: int) -> tuple[float, int]:
+def predict_rate(options: list[str]) -> tuple[float, int]:
     """Return the scans per second of `amvnet predict`, and its peak memory in MiB."""
     with TemporaryDirectory() as out:
-        command = [sys.executable, "-m", "amvnet", "predict", str(folder), "--weights", WEIGHTS]
-        command += ["--out", out, "--engine", engine, "--at-once", str(at_once)]
+        command = [sys.executable, "-m", "amvnet", "predict", *options, "--out", out]
         process = subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=SLEEPING
         )
@@ -79,18 +83,17 @@ def predict_rate(folder: Path, engine: str, at_once: int) -> tuple[float, int]:
     return (len(counted) - 1) / (counted[-1] - counted[0]), usage.ru_maxrss // 1024
 
 
-def networks_rate(folder: Path, engine: str, at_once: int) -> float:
+def networks_rate(options: list[str]) -> float:
     """Return the rate of `time_networks`, measured in another process."""
-    command = [sys.executable, __file__, str(folder), "--networks", "--engines", engine]
-    command += ["--at-once", str(at_once)]
+    command = [sys.executable, __file__, *options, "--networks"]
     output = subprocess.run(command, check=True, capture_output=True, text=True, env=SLEEPING)
     return json.loads(output.stdout.splitlines()[-1])
 
 
 @torch.inference_mode()
-def time_networks(paths: list[Path], engine: str, at_once: int) -> float:
+def time_networks(options: argparse.Namespace, paths: list[Path]) -> float:
     """Return the number of projected scans per second that the two networks score."""
-    segmenter = load(WEIGHTS, engine=engine)  # type: ignore[arg-type]
+    segmenter = load(options.weights, engine=options.engines)
     model = segmenter.model
     views = [model.project(segmenter.batch([read_scan(path)])) for path in paths]
 
@@ -99,7 +102,7 @@ def time_networks(paths: list[Path], engine: str, at_once: int) -> float:
             model.score(*views[index])
 
     def score_all(indices: range) -> None:
-        for _ in stream_scans(indices, lambda _: None, score, at_once):
+        for _ in stream_scans(indices, lambda _: None, score, int(options.at_once)):
             pass
 
     score_all(range(WARM_UP))
