@@ -190,7 +190,8 @@ def test_a_map_that_was_stopped_is_resumed_to_the_same_map(
     out = tmp_path / "map.ply"
     assert run_cli(*command(world, out).split())[0] != 0
     assert not out.exists()
-    assert "another one" in refusal(command(world, out, "--resume --voxel 0.7"))
+    for other in ("--voxel 0.7", "--height 1.5", "--columns x,y,z,intensity"):
+        assert "another one" in refusal(command(world, out, f"--resume {other}"))
     succeed(command(world, out, "--resume"))
     assert added == 4 + SCANS - 2
     assert out.read_bytes() == (tmp_path / "whole.ply").read_bytes()

@@ -150,8 +150,8 @@ class MapBuilder:
             return 0
         if earlier != request:
             raise InputError(
-                f"{path}: expected an unfinished map of the same scans, poses, weights and "
-                "voxels, found another one; leave --resume out"
+                f"{path}: expected an unfinished map of the same scans, sensor, poses, "
+                "weights and voxels, found another one; leave --resume out"
             )
         self._origin = origin
         self._table.restore(**state)

@@ -198,10 +198,15 @@ def key_of(scan: InputScan) -> tuple[str, str]:
     return scan.source, scan.name
 
 
-def digest_of(scans: Sequence[InputScan], drives: Drives | None, weights: Weights) -> str:
-    """Return a digest of all that the labels of some scans depend on."""
+def digest_of(
+    scans: Sequence[InputScan], drives: Drives | None, weights: Weights, *reading: object
+) -> str:
+    """Return a digest of all that the labels of some scans depend on.
+
+    `reading` decides how files are read: the sensor, the layout of their rows, the topic of bags.
+    """
     poses = None if drives is None else drives.digest
-    request = repr((list(map(key_of, scans)), poses, weights.digests()))
+    request = repr((list(map(key_of, scans)), poses, weights.digests(), *reading))
     return hashlib.sha256(request.encode()).hexdigest()[:16]
 
 

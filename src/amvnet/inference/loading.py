@@ -73,15 +73,12 @@ def load(
             of range; if a library of the engine is missing; or if the sensor of the weights cannot
             be simulated for int8.
     """
-    is_described = sensor is not None or height is not None
-    options = {"height": height, "keep_own": keep_own or None}
-    described = make_sensor(sensor, **options) if is_described else None
+    described = make_sensor(sensor, height=height, keep_own=keep_own or None)
     parse_layout(columns)  # before the networks are loaded, which takes long
     compute = Compute(device, engine, precision)
     segmenter = load_with(compute, weights, method, tau, graphs=graphs, report=report)
     segmenter.sensor = described
     segmenter.columns = columns
-    segmenter.keep_own = keep_own
     return segmenter
 
 

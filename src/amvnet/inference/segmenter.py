@@ -20,7 +20,7 @@ from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.memory import return_freed_memory
-from amvnet.scan import AnyArray, Scan, turned
+from amvnet.scan import AnyArray, Scan, check_scan, turned
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
 from amvnet.sensors.own_body import mark_own
@@ -42,19 +42,17 @@ class Segmenter:
 
     Attributes:
         weights, engine, at_once: as above.
-        sensor: what is known about the sensor of arrays and files. If it is None, files are
+        sensor: what is known about the sensor of arrays and files. If nothing is known, files are
             normalised by what they show, and arrays are taken as they are.
         columns: the names of the columns of arrays and files, as `__call__` takes them.
-        keep_own: whether points of the car's own body get labels as others do, if `sensor` is None.
     """
 
     def __init__(self, weights: Weights, engine: Engine, at_once: int | None = None) -> None:
         self.weights = weights
         self.engine = engine
         self.at_once = engine.at_once if at_once is None else at_once
-        self.sensor: Sensor | None = None
+        self.sensor = Sensor()
         self.columns: str | Sequence[str] | None = None
-        self.keep_own = False
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -163,14 +161,13 @@ class Segmenter:
     ) -> tuple[Scan, str]:
         """Return the scan of an array, and what was assumed of its sensor if it is described."""
         columns = columns or self.columns
-        if self.sensor is None or isinstance(points, Scan):
+        if isinstance(points, Scan):
+            return check_scan(points), ""
+        if not self.sensor.is_known:
             scan = checked_scan(points, columns, self.weights.expects.intensity)
-            if not isinstance(points, Scan):
-                scan = mark_own(scan, Sensor(keep_own=self.keep_own))
-            return scan, ""
+            return mark_own(scan, self.sensor), ""
         normaliser, assumed = self._normaliser()
-        scan = normaliser(array_cloud(points, columns), "scan")
-        return scan, assumed[0]
+        return normaliser(array_cloud(points, columns), "scan"), assumed[0]
 
     def _segment(
         self, scans: Sequence[Scan], yaws: Sequence[float] | None, assumed: Sequence[str]
@@ -213,8 +210,7 @@ class Segmenter:
     def _normaliser(self) -> tuple[Normaliser, list[str]]:
         """Return a normaliser, and the list of what it assumes of the sensors of the scans."""
         assumed: list[str] = []
-        sensor = self.sensor or Sensor(keep_own=self.keep_own)
-        return Normaliser(self.weights.expects, sensor, assumed.append), assumed
+        return Normaliser(self.weights.expects, self.sensor, assumed.append), assumed
 
     def _segment_input(self, scan: InputScan, assumed: list[str], yaw: float = 0.0) -> Segmentation:
         """Read and segment one of the scans for which a normaliser has `assumed` something."""

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -82,7 +82,7 @@ class Sensor:
     rotate: Triple | None = None
     offset: Triple | None = None
     own_body: Box | None = None
-    keep_own: bool = field(default=False, compare=False)  # a wish; it says nothing of the sensor
+    keep_own: bool = False
 
     def __post_init__(self) -> None:
         top = self.fov_up if isinstance(self.fov_up, int | float) else 90
@@ -111,6 +111,11 @@ class Sensor:
         if not is_valid:
             found = shown(getattr(self, key))
             raise InputError(f"{key}: expected {expected}, found {found}; correct the value")
+
+    @property
+    def is_known(self) -> bool:
+        """Whether anything is known; `keep_own` is a wish and says nothing of the sensor."""
+        return dataclasses.replace(self, keep_own=False) != Sensor()
 
     @property
     def turn(self) -> NDArray[np.float64]:

@@ -274,7 +274,7 @@ def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
     Raises:
         InputError: if the YAML file describes an impossible sensor.
     """
-    if dataset.described_sensor is not None and normaliser.sensor == Sensor():
+    if dataset.described_sensor is not None and not normaliser.sensor.is_known:
         normaliser = normaliser.for_sensor(described_sensor(dataset))
 
     for source, scans in dataset.recordings().items():

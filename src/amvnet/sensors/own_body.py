@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from amvnet.scan import Scan
+from amvnet.sensors.frame import QUICK_STEP
 from amvnet.sensors.lasers import SensorGeometry, measure_lasers
 from amvnet.sensors.lidars import KNOWN_BODIES, KNOWN_SENSORS, Box, Sensor
 
@@ -32,13 +33,13 @@ def own_points(xyz: np.ndarray, ring: np.ndarray | None, sensor: Sensor) -> np.n
 
     for name, box in KNOWN_BODIES.items():
         own = _inside(xyz, box)
-        lasers = SensorGeometry().override(KNOWN_SENSORS[name])
-        if own.mean() < LEAST_OWN:
-            continue
-        placed = np.isfinite(xyz[:, :3]).all(axis=1)
-        seen = measure_lasers(xyz[placed], None if ring is None else ring[placed])
-        if seen.is_like(lasers):
-            return own
+        if own.mean() >= LEAST_OWN:
+            part = xyz[::QUICK_STEP, :3]  # enough to know the lasers
+            placed = np.isfinite(part).all(axis=1)
+            of_part = None if ring is None else ring[::QUICK_STEP][placed]
+            seen = measure_lasers(part[placed], of_part)
+            if seen.is_like(SensorGeometry().override(KNOWN_SENSORS[name])):
+                return own
     return None
 
 

@@ -18,12 +18,12 @@ from amvnet.data.labels.ids import write_array
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, inside, temporary_folder
-from amvnet.inference.drive import Drives, digest_of, key_of
+from amvnet.inference.drive import Drives, key_of
 from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
-from amvnet.progress import Progress, Reporter, no_progress, report_nothing
+from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.training.plan import Plan, sized_by_init
 from amvnet.training.run import train
@@ -198,8 +198,8 @@ def adapt(
     make_plan: Callable[[Dataset], Plan],
     score: Callable[[Segmenter], float] | None = None,
     *,
+    request: str,
     progress: Callable[[str], AbstractContextManager[Progress]],
-    report: Reporter = report_nothing,
 ) -> Path:
     """Teach both networks by the consensus of their own labels over drives.
 
@@ -211,8 +211,8 @@ def adapt(
         make_plan: returns the plan of the training, given the scans with their labels.
         score: returns the mIoU of a segmenter on labelled scans, which decides whether the trained
             weights are better; by default, figures without labels do.
+        request: the digest of all that the labels depend on (`digest_of`).
         progress: returns a context that shows the progress of a step with a name.
-        report: takes a line about what happens.
 
     Returns:
         The path of the weights: the trained ones, or `weights` if they are not better.
@@ -222,7 +222,6 @@ def adapt(
     """
     plan = make_plan(TaughtScans(scans, Path(), weights))
     folder = plan.out / TEACHER
-    request = digest_of(scans, drives, weights)
     before = _read_figures(folder, request, plan.resume)
     if before is None:
         check_folder(plan)
@@ -236,20 +235,20 @@ def adapt(
                 before = teach(scans, drives, make_segmenter(weights), part, step)
             (part / FIGURES).write_text(json.dumps({"request": request, **asdict(before)}))
             part.rename(folder)
-    report(f"before: {before}")
+    plan.report(f"before: {before}")
 
     path = train(make_plan(TaughtScans(scans, folder, weights)))
     with progress("comparing") as step:
         after = teach(scans, drives, make_segmenter(load(path)), progress=step)
-    report(f"after: {after}")
+    plan.report(f"after: {after}")
     is_better = after.is_better_than(before)
     if score is not None:
         old, new = (score(make_segmenter(chosen)) for chosen in (weights, load(path)))
-        report(f"mIoU of the labelled scans: {old:.1%} before, {new:.1%} after")
+        plan.report(f"mIoU of the labelled scans: {old:.1%} before, {new:.1%} after")
         is_better = new > old
     if not is_better:
         save(weights, path)
-        report("the labels are no better than before, so the weights stay as they were")
+        plan.report("the labels are no better than before, so the weights stay as they were")
     return path
 
 
@@ -272,8 +271,8 @@ def _read_figures(folder: Path, request: str, resume: bool) -> Figures | None:
         )
     if earlier != request:
         raise InputError(
-            f"{folder.parent}: expected the scans, poses and weights of the earlier run, found "
-            "others; give another folder"
+            f"{folder.parent}: expected the scans, sensor, poses and weights of the earlier run, "
+            "found others; give another folder"
         )
     return figures
 

@@ -61,7 +61,7 @@ def adapt(
     from amvnet.data.datasets.select import to_mix_in
     from amvnet.data.datasets.simulated import SimulatedStreets
     from amvnet.data.datasets.training_data import Source, TrainingData
-    from amvnet.inference.drive import find_poses
+    from amvnet.inference.drive import digest_of, find_poses
     from amvnet.inference.listing import list_inputs
     from amvnet.sensors.normalise import Normaliser
     from amvnet.training.adapt import adapt as adapt_weights
@@ -70,8 +70,9 @@ def adapt(
     from amvnet.weights.file import load
 
     loaded = load(weights)
-    normaliser = Normaliser(loaded.expects, sensor_choice.parse(), report)
-    scans, _ = list_inputs(inputs, choice.parse(), loaded.taxonomy, normaliser)
+    sensor, options = sensor_choice.parse(), choice.parse()
+    normaliser = Normaliser(loaded.expects, sensor, report)
+    scans, _ = list_inputs(inputs, options, loaded.taxonomy, normaliser)
     recipe = recipe_for(loaded, epochs, streets, seed)
     drives = None
     if not loose:
@@ -99,7 +100,14 @@ def adapt(
 
     score = None if val is None else _score_on(val, val_sequences, loaded)
     path = adapt_weights(
-        scans, drives, loaded, make_segmenter, make_plan, score, progress=progress, report=report
+        scans,
+        drives,
+        loaded,
+        make_segmenter,
+        make_plan,
+        score,
+        request=digest_of(scans, drives, loaded, sensor, options.layout, options.topic),
+        progress=progress,
     )
     report(f"weights in {path}")
 

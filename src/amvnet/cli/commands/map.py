@@ -62,15 +62,17 @@ def map(
     if json is not None:
         outputs[json] = FIGURES
     loaded = load(weights)
-    normaliser = Normaliser(loaded.expects, sensor_choice.parse(), report)
-    scans, _ = list_inputs([inputs], choice.parse(), loaded.taxonomy, normaliser)
+    sensor, options = sensor_choice.parse(), choice.parse()
+    normaliser = Normaliser(loaded.expects, sensor, report)
+    scans, _ = list_inputs([inputs], options, loaded.taxonomy, normaliser)
     files = [path for scan in scans for path in scan.files]
     check_outputs(outputs, [*files, weights, poses], overwrite)
     with progress("poses") as step:
         drives = find_poses(scans, poses, progress=step, report=report, is_one=True)
     make_folder(out.parent)
 
-    request = f"{digest_of(scans, drives, loaded)}, {voxel:g} m"
+    reading = (sensor, options.layout, options.topic)
+    request = f"{digest_of(scans, drives, loaded, *reading)}, {voxel:g} m"
     saved = SavedMap(out.with_name(f".{out.name}.unfinished.npz"), request, resume)
     builder = MapBuilder(voxel, loaded.taxonomy)
     segmenter = load_segmenter(loaded, "amvnet", compute)
