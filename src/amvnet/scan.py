@@ -35,6 +35,8 @@ class Scan:
         own: (N,) bool: whether a point is of the car's own body, or None if none is known to be.
             Such points are not valid.
         name: the origin of the scan, for messages.
+        to_file: (4, 4) moves points that were normalised back into the frame of their file, in
+            metres; None if the points lie in this frame.
 
     Raises:
         InputError: if the shapes do not fit each other.
@@ -47,6 +49,7 @@ class Scan:
     row: np.ndarray | None = None
     source: np.ndarray | None = None
     own: np.ndarray | None = None
+    to_file: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4:

@@ -19,6 +19,8 @@ from amvnet.drives.odometry import Odometry, Pair, check_fit
 from amvnet.inference.drive import find_poses
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.pipeline import Pipeline
+from amvnet.sensors.lidars import AXES
+from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import save
 
 from fixtures.bag_poses import drive_clouds, drive_odometry, odometry, pose_at, write_bag
@@ -147,6 +149,45 @@ def test_poses_that_do_not_fit_are_one_line_and_nothing_is_written(
     line = refusal(predict(world, tmp_path / "out", f"--poses {tmp_path}/poses.npy"))
     assert "poses.npy" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_poses_of_ones_own_scans_move_the_points_of_their_files(
+    world: Path, tmp_path: Path
+) -> None:
+    turn = np.array(AXES["y-forward"], float)
+    to_file = np.eye(4)
+    to_file[:3] = np.column_stack((turn.T, (0.5, -0.3, 0.2)))  # axes and place of the file
+    for index, (points, _) in enumerate(drive_scans()):
+        (tmp_path / "robot").mkdir(exist_ok=True)
+        xyz = points[:, :3] @ turn + to_file[:3, 3]
+        np.save(tmp_path / f"robot/{index:04d}.npy", np.column_stack((xyz, points[:, 3])))
+    offset = ", ".join(map(str, -turn @ to_file[:3, 3]))
+    lines = [
+        "classes: {road: 1}",
+        "scans: robot/*.npy",
+        "poses: ../poses.txt",
+        f"sensor: {{axes: y-forward, offset: [{offset}]}}",
+    ]
+    (tmp_path / "own.yaml").write_text("\n".join(lines))
+    command = f"predict {tmp_path}/own.yaml --weights {world}/w.safetensors --drive"
+    assert "poses.txt" in refusal(f"{command} --out {tmp_path}/none")
+
+    kitti = (POSES @ np.linalg.inv(to_file))[:, :3].reshape(-1, 12)
+    np.savetxt(tmp_path / "poses.txt", kitti)
+    report: list[str] = []
+    normaliser = Normaliser(fresh_weights().expects)
+    scans, _ = list_inputs([f"{tmp_path}/own.yaml"], normaliser=normaliser)
+    drives = find_poses(scans, report=report.append)
+    assert report == ["robot: a drive of 24 scans, 23 m by the dataset"]
+    for scan, pose, (points, _) in zip(scans, POSES, drive_scans(), strict=True):
+        loaded = scan.load()
+        into_world = drives.motion(scan, loaded)
+        found = loaded.scan.points[:, :3] @ into_world[:3, :3].T + into_world[:3, 3]
+        np.testing.assert_allclose(found, points[:, :3] @ pose[:3, :3].T + pose[:3, 3], atol=1e-3)
+
+    part = scans[5].poses(scans[5:7])
+    assert part is not None
+    np.testing.assert_allclose(part[:, :3].reshape(-1, 12), kitti[5:7], atol=1e-12)
 
 
 def test_poses_of_a_standing_car_fit() -> None:

@@ -178,6 +178,25 @@ def test_any_frame_that_is_described_gives_the_same_scan(
 
     assert_alike(scan, expected)
     assert np.flatnonzero(~scan.valid).tolist() == [5]
+    assert_in_file(scan, file_xyz)
+
+
+def assert_in_file(scan: Scan, file_xyz: np.ndarray) -> None:
+    """Check that `to_file` moves the valid points to where they are in the file, in metres."""
+    assert scan.to_file is not None
+    moved = scan.points[:, :3] @ scan.to_file[:3, :3].T + scan.to_file[:3, 3]
+    np.testing.assert_allclose(moved[scan.valid], file_xyz[scan.valid], atol=1e-4)
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+def test_a_scan_knows_the_way_back_from_what_was_measured(unit: str) -> None:
+    points, _ = place(LASERS["os1-64"], 1.2)
+    tilted = points[:, :3] @ rotation_from_degrees(0, 6, -4).T
+    for expected in (fresh_weights().expects, None):
+        scale = 1000.0 if unit == "mm" else 1.0
+        normaliser = Normaliser(expected, Sensor(unit=unit))
+        scan = normaliser(Cloud(tilted * scale, points[:, 3], None, "a.pcd"), "a")
+        assert_in_file(scan, tilted)
 
 
 def test_rotations_are_yaw_pitch_and_roll() -> None:

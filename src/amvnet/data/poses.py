@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -101,6 +101,18 @@ class Trajectory:
         for axis in range(3):
             poses[:, axis, 3] = np.interp(times, self.times, self.poses[:, axis, 3])
         return poses
+
+
+def times_of(names: Iterable[str]) -> list[float] | None:
+    """Return the times of scans in seconds, if their names are numbers; large ones are nanoseconds.
+
+    Return None if a name is no number.
+    """
+    try:
+        times = [float(name) for name in names]
+    except ValueError:
+        return None
+    return [time * 1e-9 if time > 1e15 else time for time in times]
 
 
 def read_poses(path: Path) -> Trajectory:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.data.poses import Poses, check_rigid, read_poses
+from amvnet.data.poses import Poses, check_rigid, read_poses, times_of
 from amvnet.data.spacing import evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit
@@ -55,15 +55,13 @@ class Drives:
     """The poses of the scans of one or several drives.
 
     Attributes:
-        poses: the pose (4, 4) of each scan, by the recording and the name of the scan.
-        of_files: whether the poses move the unchanged points of scan files, and not the points that
-            are normalised to the weights.
+        poses: the pose (4, 4) of each scan, by the recording and the name of the scan; it moves the
+            points of the scan's file, in metres.
         past_only: whether scans after a scan do not count.
         table: maps the labels to other classes; by default, they stay unchanged.
     """
 
     poses: Mapping[tuple[str, str], Poses]
-    of_files: bool
     past_only: bool = False
     table: NDArray[np.uint8] | None = None
 
@@ -72,6 +70,10 @@ class Drives:
         """A digest of all that labels depend on."""
         values = np.array(list(self.poses.values())).tobytes()
         return f"{hashlib.sha256(values).hexdigest()[:16]}, past only: {self.past_only}"
+
+    def motion(self, scan: InputScan, loaded: LoadedScan) -> Poses:
+        """Return the motion (4, 4) of a scan, normalised to the weights, into the world."""
+        return self.poses[key_of(scan)] @ to_file(loaded.scan)
 
     @cached_property
     def yaws(self) -> dict[tuple[str, str], float]:
@@ -131,8 +133,8 @@ class Drives:
             if loaded is None or isinstance(result, InputError):
                 broken.append(outcome)
                 continue
-            xyz = points_of(loaded, self.of_files)
-            yield DriveScan(outcome, xyz, result.scores, self.poses[key_of(scan)])
+            xyz = loaded.scan.points[:, :3]
+            yield DriveScan(outcome, xyz, result.scores, self.motion(scan, loaded))
 
 
 def drive(
@@ -179,6 +181,7 @@ def drive(
                     )
                 pose = np.asarray(found, np.float64)
                 check_rigid(pose[None], "poses")
+                pose = pose @ to_file(scan)
             yield DriveScan(result, scan.points[:, :3], result.scores, pose)
 
     for result, scores, _ in Consensus(past_only=past_only).stream(segmented()):
@@ -210,11 +213,9 @@ def digest_of(
     return hashlib.sha256(request.encode()).hexdigest()[:16]
 
 
-def points_of(loaded: LoadedScan, of_files: bool) -> np.ndarray:
-    """Return the points (N, 3) of a scan that its pose moves."""
-    if of_files and loaded.file_xyz is not None:
-        return loaded.file_xyz
-    return loaded.scan.points[:, :3]
+def to_file(scan: Scan) -> Poses:
+    """Return the motion (4, 4) of a scan's points into the frame of its file."""
+    return np.eye(4) if scan.to_file is None else scan.to_file
 
 
 def find_poses(
@@ -260,7 +261,6 @@ def find_poses(
             )
 
     found: dict[tuple[str, str], Poses] = {}
-    of_files = path is not None
     for source, members in sources.items():
         name = str(path) if is_file else source
         poses, where = _recorded(members, path, report)
@@ -272,11 +272,11 @@ def find_poses(
             poses, where = _estimated(members, progress), "KISS-ICP"
 
         check_rigid(poses, name)
-        check_fit(_pairs(members, poses, of_files), name)
+        check_fit(_pairs(members, poses), name)
         metres = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
         report(f"{name}: a drive of {counted(len(members), 'scan')}, {metres:.0f} m by {where}")
         found |= {key_of(scan): pose for scan, pose in zip(members, poses, strict=True)}
-    return Drives(found, of_files, past_only)
+    return Drives(found, past_only)
 
 
 def _recorded(
@@ -302,7 +302,8 @@ def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:
         progress(index, len(scans))
         try:
             loaded = scan.load().scan
-            poses.append(odometry(loaded.points[loaded.valid, :3]))
+            pose = odometry(loaded.points[loaded.valid, :3])
+            poses.append(pose @ np.linalg.inv(to_file(loaded)))
         except InputError:  # the segmentation reports the broken scan
             poses.append(poses[-1] if poses else np.eye(4))
     progress(len(scans), len(scans))
@@ -310,24 +311,14 @@ def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:
 
 
 def _times(scans: Sequence[InputScan]) -> list[float] | None:
-    """Return the times of scans in seconds: their stamps in a bag, or numbers that are their names.
-
-    Return None if a name is no number. Large numbers are nanoseconds.
-    """
+    """Return the times of scans in seconds, if their bag or their names state them."""
     bag = scans[0].bag
     if bag is not None:
         return bag.times()
-
-    times = []
-    for scan in scans:
-        with suppress(ValueError):
-            times.append(float(Path(scan.name).name.removesuffix(scan.path.suffix)))
-    if len(times) < len(scans):
-        return None
-    return [time * 1e-9 if time > 1e15 else time for time in times]
+    return times_of(Path(scan.name).name.removesuffix(scan.path.suffix) for scan in scans)
 
 
-def _pairs(scans: Sequence[InputScan], poses: Poses, of_files: bool) -> Iterator[Pair]:
+def _pairs(scans: Sequence[InputScan], poses: Poses) -> Iterator[Pair]:
     """Yield pairs of scans that show whether the poses fit; unreadable scans show nothing."""
     for first in evenly_spaced(range(len(scans) - 1), PAIRS):
         # The farther apart two scans are, the more a wrong motion shows, if they see the same
@@ -336,11 +327,12 @@ def _pairs(scans: Sequence[InputScan], poses: Poses, of_files: bool) -> Iterator
         is_near = np.linalg.norm(ahead, axis=1) < FAR
         last = first + max(int(np.cumprod(is_near).sum()), 1)
         with suppress(InputError):
-            before, after = (_standing(scans[index].load(), of_files) for index in (first, last))
-            yield Pair(before, after, np.linalg.inv(poses[first]) @ poses[last])
+            before, after = scans[first].load().scan, scans[last].load().scan
+            into_world = poses[first] @ to_file(before)
+            motion = np.linalg.inv(into_world) @ poses[last] @ to_file(after)
+            yield Pair(_standing(before), _standing(after), motion)
 
 
-def _standing(loaded: LoadedScan, of_files: bool) -> np.ndarray:
-    """Return the points of a scan that stand above the ground."""
-    is_standing = loaded.scan.valid & (loaded.scan.points[:, 2] > STANDING)
-    return points_of(loaded, of_files)[is_standing]
+def _standing(scan: Scan) -> np.ndarray:
+    """Return the points (M, 3) of a scan that stand above the ground."""
+    return scan.points[scan.valid & (scan.points[:, 2] > STANDING), :3]

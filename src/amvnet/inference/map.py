@@ -11,7 +11,7 @@ import numpy as np
 
 from amvnet.data.poses import Poses
 from amvnet.drives.world_map import MapBuilder, WorldMap
-from amvnet.inference.drive import Drives, key_of, points_of
+from amvnet.inference.drive import Drives, key_of
 from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
@@ -45,9 +45,8 @@ def map_drive(
     """
 
     def segment(scan: InputScan, loaded: LoadedScan) -> tuple[np.ndarray, Segmentation, Poses]:
-        points = points_of(loaded, drives.of_files)
         result = segmenter(loaded.scan, yaw=drives.yaws[key_of(scan)])
-        return points, result, drives.poses[key_of(scan)]
+        return loaded.scan.points[:, :3], result, drives.motion(scan, loaded)
 
     done = 0
     if saved is not None and saved.resume:

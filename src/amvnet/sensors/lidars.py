@@ -141,6 +141,17 @@ class Sensor:
         level[(xyz == 0).all(axis=1)] = np.nan
         return level
 
+    def to_file(self, rise: float = 0.0) -> NDArray[np.float64]:
+        """Return the motion (4, 4) that undoes `to_level` and then a rise by `rise` metres.
+
+        It moves points into the file's frame, in metres whatever the file's unit is.
+        """
+        motion = np.eye(4)
+        motion[:3, :3] = self.turn.T
+        x, y, z = self.offset or (0.0, 0.0, 0.0)
+        motion[:3, 3] = -self.turn.T @ (x, y, z + rise)
+        return motion
+
 
 def _is_within(value: Any, low: float, high: float) -> bool:
     return value is None or (isinstance(value, int | float) and low <= value <= high)

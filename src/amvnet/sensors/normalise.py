@@ -66,13 +66,15 @@ def normalise(
     seen, _ = fill_intensity(seen, expected.intensity)
     to_sensor, to_trained = estimate.frame.rises(sensor, height)
     moved = raise_points(seen, to_trained - to_sensor)
+    complete = estimate.frame.complete(sensor)
 
     lasers = estimate.lasers.override(sensor)
-    row = _rows_by_laser(seen, estimate.frame.complete(sensor), lasers, expected)
+    row = _rows_by_laser(seen, complete, lasers, expected)
     if row is None:
         row = _rows(seen, lasers, expected)
     own = own_points(cloud.xyz * UNITS[estimate.frame.unit], cloud.ring, sensor)
-    return dataclasses.replace(moved, row=row, own=own), ring_fault
+    to_file = complete.to_file(to_trained)
+    return dataclasses.replace(moved, row=row, own=own, to_file=to_file), ring_fault
 
 
 def describe(
@@ -248,6 +250,7 @@ class Normaliser:
         xyz = self.sensor.to_level(cloud.xyz)
         scale = self.sensor.intensity_scale or cloud.intensity_scale()
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
+        scan = dataclasses.replace(scan, to_file=self.sensor.to_file())
 
         if source not in self._reported:
             has_intensity = cloud.intensity is not None and scale is not None

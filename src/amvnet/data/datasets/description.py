@@ -17,7 +17,7 @@ from amvnet.errors import InputError, did_you_mean, errors_of, shown
 
 ENDINGS = (".yaml", ".yml")
 KEYS = (
-    *("name", "root", "classes", "ignored", "scans", "labels", "split", "sensor"),
+    *("name", "root", "classes", "ignored", "scans", "labels", "poses", "split", "sensor"),
     *("columns", "dtype"),
 )
 SPLITS = ("train", "val", "test")
@@ -66,6 +66,8 @@ class Description:
         labels: where the labels are; None if there are none.
         unread: the classes of the labels, if they are not the classes in `taxonomy`. Such labels
             are not read.
+        poses: the file of the poses of all scans in a folder, relative to this folder; empty if
+            the poses are unknown.
         split: names of folders and scans, and patterns, by split; empty if there is no split.
         sensor: the name or the attributes of the sensor; None if it is to be measured.
         layout: what rows of numbers without names hold.
@@ -76,6 +78,7 @@ class Description:
     taxonomy: Taxonomy
     scans: str
     labels: LabelPlace | None = None
+    poses: str = ""
     unread: Taxonomy | None = None
     split: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sensor: str | Mapping[str, Any] | None = None
@@ -116,6 +119,7 @@ def _parse(path: Path, tree: Any) -> Description:
         taxonomy=_parse_classes(_text(tree, "name", path.stem), tree),
         scans=scans,
         labels=_parse_labels(tree.get("labels")),
+        poses=_text(tree, "poses", ""),
         split=_parse_split(tree.get("split") or {}),
         sensor=tree.get("sensor"),
         layout=RowLayout(

@@ -12,10 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, Normalise, ScanRecord
-from amvnet.data.datasets.description import SPLITS, WILDCARDS, Description, read_description
+from amvnet.data.datasets.description import (
+    SPLITS,
+    WILDCARDS,
+    Description,
+    below,
+    read_description,
+)
 from amvnet.data.formats.find import ANY_FOLDERS, NamedScan, list_scans, matching, scan_stem
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_raw_labels
+from amvnet.data.poses import Poses, read_poses, times_of
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError, did_you_mean, readable, reason_of, shown
 from amvnet.scan import Scan
@@ -130,6 +137,26 @@ class OwnScans(Dataset):
         missing = self.taxonomy.train_to_raw[0]
         return read_raw_labels(record.labels_path, count, place.field, layout, missing=missing)
 
+    def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
+        """Return the poses that the description names; a file has those of all its folder's scans.
+
+        They belong to the scans in order. If the file has times and another number of poses, they
+        belong to scans whose names are their times.
+        """
+        if not self.description.poses:
+            return None
+
+        files = {name: self._poses_file(scan) for name, scan in self._scans.items()}
+        poses: dict[str, Poses] = {}
+        for path in dict.fromkeys(files[record.name] for record in records):
+            names = [name for name in files if files[name] == path]
+            times = times_of(Path(name).name for name in names)
+            poses |= zip(names, read_poses(path).at(times, len(names)), strict=True)
+        return np.array([poses[record.name] for record in records])
+
+    def _poses_file(self, scan: NamedScan) -> Path:
+        return below(scan.path.parent, self.description.poses)
+
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan; the file is not read a second time."""
         if record.name not in self._counts:
@@ -163,12 +190,14 @@ class OwnScans(Dataset):
         return place.path_of(scan.path, scan.name)
 
     def files_of(self, record: ScanRecord) -> list[Path]:
-        """Return the files of a scan, with its label file even if labels are not read."""
+        """Return the files of a scan, with its poses, and its labels even if they are not read."""
         files = super().files_of(record)
+        scan = self._scans[record.name]
         place = self.description.labels
         if place is not None:
-            scan = self._scans[record.name]
             files.append(place.path_of(scan.path, scan.name))
+        if self.description.poses:
+            files.append(self._poses_file(scan))
         return files
 
     @cached_property
