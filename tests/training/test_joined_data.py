@@ -432,7 +432,7 @@ def test_any_classes_fit_a_recipe_that_takes_the_model_of_init(tmp_path: Path) -
     """They get new last layers."""
     data = open_dataset(str(make_streets(tmp_path, ("00", "08"), 1)))
     scans = TrainingData([to_train(data)])
-    recipe = sized_by_init(load_recipe("finetune"), fresh_weights(NUSCENES))
-    Plan(recipe, scans, tmp_path / "run")
+    init = fresh_weights(NUSCENES)
+    Plan(sized_by_init(load_recipe("finetune"), init), scans, tmp_path / "run", init)
     with pytest.raises(InputError, match="use the recipe of that benchmark"):
         Plan(load_recipe("nuscenes-compact"), scans, tmp_path / "run")

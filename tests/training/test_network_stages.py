@@ -29,18 +29,21 @@ from amvnet.training.networks import PolarStage, make_loaders, make_stage
 from amvnet.training.plan import Plan
 from amvnet.training.stage import Precision
 
-from fixtures.tiny import MODEL, street
+from fixtures.tiny import MODEL, fresh_weights, street
 
 CONFIG = NetworkTraining(epochs=1, batch=2, lr=1e-3)
 MODEL_CONFIG = from_dict(ModelConfig, MODEL)
-ALL = np.ones((2, 19), bool)  # both datasets teach all classes
+# Of two datasets, the first does not teach the class 4.
+RIVALS = np.ones((2, 19), bool)
+RIVALS[0, 4] = False
 
 
 def plan_with(config: NetworkTraining) -> Plan:
-    """Return a plan without scans, in which both networks are trained alike."""
+    """Return a plan without scans, in which both networks are trained further alike."""
     training = replace(TrainingConfig(), rv=config, bev=config)
     dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
-    return Plan(Recipe(training=training), TrainingData([Source(dataset, [])]), Path("run"))
+    data = TrainingData([Source(dataset, [])])
+    return Plan(Recipe(training=training), data, Path("run"), init=fresh_weights())
 
 
 def polar_stage() -> PolarStage:
@@ -88,7 +91,7 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
 def test_pixels_and_voxels_have_the_source_of_their_points(stage: str) -> None:
     """The source is the scan here, so that no pixel and no voxel has points of two sources."""
     batch, labels = batch_of_two()
-    made = make_stage(plan_with(CONFIG), stage, build_amvnet(MODEL_CONFIG, 19), None, ALL).eval()
+    made = make_stage(plan_with(CONFIG), stage, build_amvnet(MODEL_CONFIG, 19)).eval()
     with torch.no_grad():
         scored = made.compare((batch, labels, batch.scan))
     assert scored.source is not None
@@ -112,7 +115,7 @@ def test_on_a_cpu_all_convolutions_of_a_training_step_have_channels_last(stage: 
     plan = plan_with(CONFIG)
     training = replace(plan.recipe.training, accelerator="cpu")
     plan = replace(plan, recipe=Recipe(training=training))
-    made = make_stage(plan, stage, build_amvnet(config, 19), None, ALL)
+    made = make_stage(plan, stage, build_amvnet(config, 19))
     are_last: list[bool] = []
 
     def note(net: nn.Module, inputs: Any, output: torch.Tensor) -> None:
@@ -139,7 +142,7 @@ def test_a_network_alone_computes_in_the_lower_precision(
     model = build_amvnet(replace(MODEL_CONFIG, range_view=view), 19)
     plan = plan_with(CONFIG)
     training = replace(plan.recipe.training, precision=precision)
-    made = make_stage(replace(plan, recipe=Recipe(training=training)), stage, model, None, ALL)
+    made = make_stage(replace(plan, recipe=Recipe(training=training)), stage, model)
     types: list[torch.dtype] = []
 
     def note(net: nn.Module, inputs: Any, output: torch.Tensor) -> None:
@@ -155,10 +158,8 @@ def test_a_network_alone_computes_in_the_lower_precision(
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> None:
-    present = ALL.copy()
-    present[0, 4] = False
     model = build_amvnet(MODEL_CONFIG, 19)
-    made: Any = make_stage(plan_with(CONFIG), stage, model, None, present).eval()
+    made: Any = make_stage(plan_with(CONFIG), stage, model, None, RIVALS).eval()
     made.log = lambda *_, **__: None
     made.step_factor = lambda *_: 1.0
     batch, labels = batch_of_two()
@@ -178,10 +179,8 @@ def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> No
 def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(stage: str) -> None:
     config = replace(CONFIG, distill=2.0)
     plan, model = plan_with(config), build_amvnet(MODEL_CONFIG, 19)
-    assert not make_stage(plan, stage, model, None, ALL).teachers
-    taught = ALL.copy()
-    taught[0, 4] = False
-    made: Any = make_stage(plan, stage, model, None, taught)
+    assert not make_stage(plan, stage, model).teachers
+    made: Any = make_stage(plan, stage, model, None, RIVALS)
     made.log = lambda *_, **__: None
     made.step_factor = lambda *_: 1.0
     (teacher,) = made.teachers
@@ -212,7 +211,7 @@ def test_the_loss_of_a_stage_equals_its_formula_with_all_weights(
     of_paper = {"rv": dice, "bev": lovasz_softmax}[stage]
     region_loss = {"default": of_paper, "dice": dice, "lovasz": lovasz_softmax}[name]
     weights = np.linspace(0.2, 3, 19, dtype=np.float32)
-    made = make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), weights, ALL)
+    made = make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), weights)
 
     batch, labels = batch_of_two()
     with torch.no_grad():

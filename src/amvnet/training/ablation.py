@@ -36,8 +36,8 @@ def sweep_heads(
     """Train a head for each value of a parameter, and yield its figures (Fig. 8 of the paper).
 
     Args:
-        plan: how the heads are trained. Each head is kept in a folder inside the plan's folder. It
-            is not trained again if it is finished.
+        plan: how the heads are trained, with the stage `head`. Each head is kept in a folder inside
+            the plan's folder. It is not trained again if it is finished.
         device: the device on which the heads are scored, such as "cpu" or "cuda".
 
     Raises:
@@ -48,7 +48,7 @@ def sweep_heads(
         networks = _networks(weights, model)
         recipe = dataclasses.replace(plan.recipe, model=model)
         out = plan.out / f"{value:g}"
-        head_plan = dataclasses.replace(plan, recipe=recipe, out=out, init=networks, stage="head")
+        head_plan = dataclasses.replace(plan, recipe=recipe, out=out, init=networks)
 
         segmenter = load(train(head_plan), device)
         evaluation = evaluate(dataset, plan.data.val, label_by_weights(dataset, segmenter))
@@ -85,7 +85,8 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
     """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
 
     Args:
-        plan: how the networks are trained. Each network is kept in a folder inside the plan's.
+        plan: how the networks are trained, with the stage `rv`. Each network is kept in a folder
+            inside the plan's.
         device: the device on which the networks are scored, such as "cpu" or "cuda".
 
     Yields:
@@ -99,7 +100,7 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
         name = _name(gru, weighted)
         plan.report(f"{name}:")
         recipe = _ablated(plan.recipe, gru, weighted)
-        path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name, stage="rv"))
+        path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name))
 
         segmenter = load(path, plan.processes.device(choose_device(device)), "rv")
         dataset = plan.data.sources[0].dataset

@@ -8,7 +8,6 @@ import numpy as np
 
 from amvnet.data.check import check_scans
 from amvnet.data.datasets.base import Dataset
-from amvnet.errors import InputError
 from amvnet.progress import Progress, Tenths
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.expectation import expected_after
@@ -21,7 +20,7 @@ from amvnet.training.run_folder import (
     with_finished,
 )
 from amvnet.weights.file import Weights
-from amvnet.weights.parts import differences, for_classes, head_fits, replace_part
+from amvnet.weights.parts import differences, for_classes, head_fits, replace_part, resized
 
 # A dataset teaches a class if more than this share of its labelled points have it. A few points may
 # have it by mistake.
@@ -52,13 +51,11 @@ def check(plan: Plan) -> Checked:
     """Check all stages of a plan before anything is written, and before hours are spent on one.
 
     Raises:
-        InputError: if a stage cannot begin or be resumed, the weights to begin with do not fit, or
-            `check_data` finds an error.
+        InputError: if a stage cannot begin or be resumed, or `check_data` finds an error.
     """
     weights = first_weights(plan)
     for name in plan.stages:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
-        _check_initial(plan, name)
     counts, taught = check_data(plan)
     plan.processes.wait()  # until all streets of the first epoch are simulated
     expects = plan.expects or expected_after(plan.data, weights, plan.recipe, plan.stages)
@@ -87,32 +84,19 @@ def first_weights(plan: Plan) -> Weights:
             plan.report("head: new, because the head of the initial weights has other sizes")
             continue
         weights = replace_part(weights, part, begun)
-        if not is_trained:
+        if is_trained:  # whatever sizes its initial weights state
+            weights = resized(weights, part, plan.recipe.model)
+        else:
             kept = differences(init, part, plan.recipe.model)
             if kept:
                 plan.report(f"{part}: is not trained, so it stays as in --init: {'; '.join(kept)}")
-        elif not has_classes:
+        if not has_classes:
             of_part = ", ".join(key for key in new if key.startswith(f"{part}."))
             plan.report(
                 f"{part}: the initial weights ({init.taxonomy.name}), with new layers for the "
                 f"classes of {taxonomy.name}: {of_part}"
             )
     return with_finished(plan, weights)
-
-
-def _check_initial(plan: Plan, name: str) -> None:
-    """Raise InputError if a network needs initial weights that --init does not have."""
-    config = getattr(plan.recipe.training, name)
-    part = PART_OF[name]
-    parts = plan.init.parts if plan.init else ()
-    for option in ("initial", "distill"):
-        if getattr(config, option, 0) and part not in parts:
-            found = f"{', '.join(parts)} in --init" if parts else "none"
-            raise InputError(
-                f"training.{name}.{option}: expected weights of {part} to begin with, found "
-                f"{found}; give --init with this part, set the option to 0, or train another "
-                "--stage"
-            )
 
 
 def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:

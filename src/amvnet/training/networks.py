@@ -270,8 +270,9 @@ def train_network(plan: Plan, checked: Checked, name: str, weights: Weights) -> 
     loaders = make_loaders(plan, config, weights.expects)
     # The class weights of the loss (section 4.2 of the paper).
     loss_weights = class_weights(checked.class_counts) if config.class_weights else None
-    stage = make_stage(plan, name, model, loss_weights, checked.taught)
-    for line in _notes(plan, name, checked.taught):
+    rivals = rival_classes(checked.taught)
+    stage = make_stage(plan, name, model, loss_weights, rivals)
+    for line in _notes(plan, name, checked.taught, rivals):
         plan.report(line)
     try:
         fit(stage, plan, loaders, weights)
@@ -283,7 +284,7 @@ def train_network(plan: Plan, checked: Checked, name: str, weights: Weights) -> 
         ) from None
 
 
-def _notes(plan: Plan, name: str, taught: np.ndarray) -> Iterator[str]:
+def _notes(plan: Plan, name: str, taught: np.ndarray, rivals: np.ndarray | None) -> Iterator[str]:
     """Yield lines about classes that a dataset lacks, and about scans that no epoch uses."""
     config = getattr(plan.recipe.training, name)
     sources = plan.data.sources
@@ -291,7 +292,6 @@ def _notes(plan: Plan, name: str, taught: np.ndarray) -> Iterator[str]:
     def listed(row: Any) -> str:
         return ", ".join(plan.data.taxonomy.classes[index] for index in np.flatnonzero(row))
 
-    rivals = rival_classes(taught)
     kept = ", and keep the probabilities of --init there (distill)" if config.distill else ""
     for source, row in zip(sources, [] if rivals is None else ~rivals, strict=False):
         if row.any():
@@ -318,16 +318,18 @@ def _notes(plan: Plan, name: str, taught: np.ndarray) -> Iterator[str]:
 
 
 def make_stage(
-    plan: Plan, name: str, model: AMVNet, weights: np.ndarray | None, taught: np.ndarray
+    plan: Plan,
+    name: str,
+    model: AMVNet,
+    weights: np.ndarray | None = None,
+    rivals: np.ndarray | None = None,
 ) -> RangeStage | PolarStage:
     """Return the stage `rv` or `bev` of a model.
 
     Args:
-        weights: (K,) class weights of the loss, or None for equal weights.
-        taught: (M, K) bool, whether each of the M datasets teaches each class.
+        weights, rivals: as `NetworkStage` takes them.
     """
     config = getattr(plan.recipe.training, name)
-    rivals = rival_classes(taught)
     shared: dict[str, Any] = {
         "config": config,
         "taxonomy": plan.data.taxonomy,

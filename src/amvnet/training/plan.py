@@ -52,7 +52,8 @@ class Plan:
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, the recipe is for other
-            classes than the dataset's, or `scores` are for another stage than the head.
+            classes than the dataset's or needs a network that `init` lacks, or `scores` are for
+            another stage than the head.
     """
 
     recipe: Recipe
@@ -97,6 +98,23 @@ class Plan:
                 f"expected a dataset with the classes of {self.recipe.taxonomy}, "
                 f"found {taxonomy}; use the recipe of that benchmark"
             )
+
+        for name in self.stages:
+            if name in NETWORK_OF:
+                self._check_initial(name, NETWORK_OF[name])
+
+    def _check_initial(self, name: str, part: str) -> None:
+        """Raise InputError if the network of a stage needs initial weights and there are none."""
+        config = getattr(self.recipe.training, name)
+        parts = self.init.parts if self.init else ()
+        for option in ("initial", "distill"):
+            if getattr(config, option) and part not in parts:
+                found = f"{', '.join(parts)} in --init" if parts else "none"
+                raise InputError(
+                    f"training.{name}.{option}: expected weights of {part} to begin with, found "
+                    f"{found}; give --init with this part, set the option to 0, or train another "
+                    "--stage"
+                )
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -20,13 +20,11 @@ from amvnet.training.run_folder import (
     alone_in_run,
     check_folder,
     is_finished,
-    keep_counts,
     with_finished,
     with_trained,
     write_record,
 )
 from amvnet.weights.file import Weights, save
-from amvnet.weights.parts import resized
 
 
 def train(plan: Plan) -> Path:
@@ -43,8 +41,7 @@ def train(plan: Plan) -> Path:
     with alone_in_run(plan):
         checked = check(plan)
         if plan.processes.first:
-            write_record(plan)
-            keep_counts(plan, checked.class_counts)
+            write_record(plan, checked.class_counts)
 
         # Save after each stage, so that a stage that fails does not lose the earlier ones.
         path = plan.out / WEIGHTS
@@ -78,9 +75,7 @@ def train_stage(plan: Plan, checked: Checked, name: str, weights: Weights) -> We
     if plan.resume and is_finished(plan, name):
         return with_trained(plan, name, weights)
 
-    # The recipe decides the sizes of the part, whatever sizes the weights state.
     L.seed_everything(plan.recipe.training.seed, verbose=False)
-    weights = resized(weights, PART_OF[name], plan.recipe.model)
     weights = dataclasses.replace(weights, expects=checked.expects)
     if name == "head":
         train_head(plan, weights)

@@ -139,8 +139,12 @@ def stages_of_folder(plan: Plan) -> Sequence[str]:
     return list(PART_OF) if plan.scores is None else ["head"]
 
 
-def write_record(plan: Plan) -> None:
-    """Write recipe.yaml, and the entry of this call into run.yaml."""
+def write_record(plan: Plan, counts: np.ndarray) -> None:
+    """Write the entry of this call into run.yaml, recipe.yaml, and the points of each class.
+
+    Args:
+        counts: (K,) counts of points by class, which `weights.calibrate` reads.
+    """
     specs = plan.data.specs
     entry: dict[str, Any] = {
         "versions": {name: version(name) for name in PACKAGES},
@@ -163,10 +167,6 @@ def write_record(plan: Plan) -> None:
     if plan.recipe.from_init:
         del recipe["model"]
     write_yaml(plan.out / RECIPE, recipe)
-
-
-def keep_counts(plan: Plan, counts: np.ndarray) -> None:
-    """Write the (K,) counts of points by class into the folder, for `weights.calibrate`."""
     with atomic_write(plan.out / COUNTS) as part:
         names = [record.name for record in plan.data.train]
         np.savez(part, counts=counts, scans=names, classes=plan.data.taxonomy.classes)

@@ -103,8 +103,7 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
         The weights, without metrics, and the names of the new parameters.
     """
     with torch.device("meta"):  # takes no memory
-        few = build_amvnet(weights.model, 1).state_dict()
-        more = build_amvnet(weights.model, 2).state_dict()
+        larger = build_amvnet(weights.model, taxonomy.size + 1).state_dict()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         fresh = build_amvnet(weights.model, taxonomy.size).state_dict()
@@ -112,7 +111,7 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
     tensors = {}
     new = []
     for key, tensor in weights.tensors.items():
-        depends_on_classes = few[key].shape != more[key].shape
+        depends_on_classes = fresh[key].shape != larger[key].shape
         tensors[key] = fresh[key] if depends_on_classes else tensor
         if depends_on_classes:
             new.append(key)

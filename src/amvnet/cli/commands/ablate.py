@@ -43,6 +43,7 @@ def ablate(
         [data],
         out,
         choose=choice.source,
+        stage="rv",
         report=report,
         resume=True,
         bars=on_terminal(),

@@ -78,7 +78,7 @@ def analyze(
     if recipe is not None:
         train = dataset.labelled(choose_records(dataset, train_sequences, "train"))
         taught = TrainingData([Source(dataset, train, records)])
-        plan = Plan(load_recipe(recipe), taught, out, resume=True, report=report)
+        plan = Plan(load_recipe(recipe), taught, out, stage="head", resume=True, report=report)
 
     segmenter = load_segmenter(loaded, "amvnet", compute)
     make_folder(out)
