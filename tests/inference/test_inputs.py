@@ -21,7 +21,7 @@ from amvnet.data.formats.registry import read_file
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.predict import ADVICE, report_certainty
-from amvnet.inference.reading import array_scan
+from amvnet.inference.reading import array_cloud, array_scan
 from amvnet.scan import Scan
 from amvnet.sensors import normalise
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
@@ -292,7 +292,7 @@ TRAINED = TrainedIntensity(tuple(np.linspace(0.1, 0.9, len(PROBABILITIES)).tolis
 def test_an_array_is_taken_with_any_columns(array: np.ndarray, columns: str | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        scan = array_scan(array, columns)
+        scan = array_scan(array_cloud(array, columns))
     np.testing.assert_array_equal(scan.points, POINTS)
     has_ring = array.shape[1] == 5
     np.testing.assert_array_equal(scan.ring, RING if has_ring else None)
@@ -304,7 +304,7 @@ def test_an_array_is_taken_with_any_columns(array: np.ndarray, columns: str | No
 
 def test_an_array_without_intensity_gets_those_that_the_weights_need_and_a_warning() -> None:
     with pytest.warns(UserWarning, match="no intensity: drawn at random"):
-        scan = array_scan(POINTS[:, :3], trained=TRAINED)
+        scan = array_scan(array_cloud(POINTS[:, :3]), TRAINED)
     np.testing.assert_array_equal(scan.points[:, :3], POINTS[:, :3])
     np.testing.assert_array_equal(scan.points[:, 3], TRAINED.filler(len(POINTS)))
 
@@ -327,7 +327,7 @@ def test_an_array_without_intensity_gets_those_that_the_weights_need_and_a_warni
 def test_an_array_of_another_shape_is_refused(
     array: np.ndarray, columns: str | None, word: str
 ) -> None:
-    fails(lambda: array_scan(array, columns), "expected", word)
+    fails(lambda: array_cloud(array, columns), "expected", word)
 
 
 def test_inputs_of_different_classes_are_refused(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ class Fusion:
         Raises:
             InputError: if the shapes do not fit, or the scores are not probabilities.
         """
-        scan = self.expects.prepare(checked_scan(points, trained=self.expects.intensity))
+        scan = self.expects.prepare(checked_scan(points, self.expects.intensity))
         f_all = as_array(f, "scores f").astype(np.float32, copy=False)
         g_all = as_array(g, "scores g").astype(np.float32, copy=False)
         self._check_shapes(scan, f_all, g_all)

@@ -20,43 +20,19 @@ MAX_COLUMNS = 64
 EXPECTED = "points of shape (N, 3 or more) with columns x, y, z, intensity"
 
 
-def checked_scan(
-    points: AnyArray | Scan,
-    columns: str | Sequence[str] | None = None,
-    trained: TrainedIntensity | None = None,
-) -> Scan:
-    """Return a scan, or the scan that `array_scan` makes of an array; check that it has a point.
+def checked_scan(points: AnyArray | Scan, trained: TrainedIntensity | None = None) -> Scan:
+    """Return a scan, or the scan that `array_scan` makes of an array.
 
     Raises:
-        InputError: if `array_scan` raises it, or no point is valid.
+        InputError: if the array cannot be read, or no point is valid.
     """
-    scan = points if isinstance(points, Scan) else array_scan(points, columns, trained)
-    return check_scan(scan)
+    if isinstance(points, Scan):
+        return check_scan(points)
+    return array_scan(array_cloud(points), trained)
 
 
 def array_cloud(points: AnyArray, columns: str | Sequence[str] | None = None) -> Cloud:
-    """Return the points of an array as those of a file; `array_scan` documents the arguments."""
-    names = parse_layout(columns).columns
-    with errors_of("scan"):
-        array = as_array(points, EXPECTED)
-    if array.dtype.names is not None:
-        fields = array.ravel()
-        values = [fields[name] for name in array.dtype.names]
-        names = names or array.dtype.names
-        require_columns(names, "scan")
-    else:
-        _check_shape(array)
-        values = list(array.T)
-        names = names or name_columns(array)
-    return named_cloud(values, names, "scan")
-
-
-def array_scan(
-    points: AnyArray,
-    columns: str | Sequence[str] | None = None,
-    trained: TrainedIntensity | None = None,
-) -> Scan:
-    """Return the scan of an array that has the columns of a scan file.
+    """Return the points of an array as those of a scan file.
 
     Args:
         points: (N, 3 or more) x, y, z in metres, intensity in [0, 1], ring; or an array of any
@@ -65,13 +41,34 @@ def array_scan(
         columns: the names of the columns in order, as a list or separated by commas. Only x, y, z,
             intensity and ring are used. By default, named fields keep their names; other columns
             are x, y, z and intensity, followed by the ring if the values suggest it.
+
+    Raises:
+        InputError: if the shape is another one, or names of columns are missing.
+    """
+    names = parse_layout(columns).columns
+    with errors_of("scan"):
+        array = as_array(points, EXPECTED)
+    if array.dtype.names is None:
+        _check_shape(array)
+        values = list(array.T)
+        names = names or name_columns(array)
+    else:
+        fields = array.ravel()
+        values = [fields[name] for name in array.dtype.names]
+        names = names or array.dtype.names
+        require_columns(names, "scan")
+    return named_cloud(values, names, "scan")
+
+
+def array_scan(cloud: Cloud, trained: TrainedIntensity | None = None) -> Scan:
+    """Return the scan of an array, given its `array_cloud`; nothing is measured.
+
+    Args:
         trained: fills in intensities with a warning if there are none; without it, they are 0.
 
     Raises:
-        InputError: if the shape is another one, names of columns are missing, or the coordinates
-            are clearly not metres.
+        InputError: if the coordinates are clearly not metres, or no point is valid.
     """
-    cloud = array_cloud(points, columns)
     with errors_of("scan"):
         check_metres(cloud)
     count = len(cloud.xyz)
@@ -81,7 +78,7 @@ def array_scan(
         intensity = np.zeros(count) if trained is None else trained.filler(count)
         warnings.warn(
             f"the scan has no intensity: {describe_filler(trained)}; give a fourth column",
-            stacklevel=5,
+            stacklevel=4,
         )
 
     table = np.empty((count, 4), np.float32)
@@ -89,7 +86,7 @@ def array_scan(
     with np.errstate(over="ignore", invalid="ignore"):
         table[:, :3] = cloud.xyz
         table[:, 3] = intensity
-    return Scan(table, ring=cloud.ring)
+    return check_scan(Scan(table, ring=cloud.ring))
 
 
 def _check_shape(array: np.ndarray) -> None:

@@ -14,7 +14,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
 from amvnet.inference.listing import FileReader, InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import array_cloud, checked_scan
+from amvnet.inference.reading import array_cloud, array_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName
@@ -98,7 +98,7 @@ class Segmenter:
             points: one of
                 - (N, 4) x, y, z in metres and intensity in [0, 1], as an array, a tensor or a list;
                   if the segmenter knows the sensor, in the sensor's units, and normalised as files;
-                - an array with other columns or with named fields (`array_scan`);
+                - an array with other columns or with named fields (`array_cloud`);
                 - a `Scan`;
                 - the path of a scan file. The scan is normalised to the weights, as `amvnet
                   predict` normalises it.
@@ -160,14 +160,14 @@ class Segmenter:
         self, points: AnyArray | Scan, columns: str | Sequence[str] | None = None
     ) -> tuple[Scan, str]:
         """Return the scan of an array, and what was assumed of its sensor if it is described."""
-        columns = columns or self.columns
-        if isinstance(points, Scan):
-            return check_scan(points), ""
-        if not self.sensor.is_known:
-            scan = checked_scan(points, columns, self.weights.expects.intensity)
+        if not isinstance(points, Scan):
+            cloud = array_cloud(points, columns or self.columns)
+            if self.sensor.is_known:
+                normaliser, assumed = self._normaliser()
+                return normaliser(cloud, "scan"), assumed[0]
+            scan = array_scan(cloud, self.weights.expects.intensity)
             return mark_own(scan, self.sensor), ""
-        normaliser, assumed = self._normaliser()
-        return normaliser(array_cloud(points, columns), "scan"), assumed[0]
+        return check_scan(points), ""
 
     def _segment(
         self, scans: Sequence[Scan], yaws: Sequence[float] | None, assumed: Sequence[str]
