@@ -17,13 +17,7 @@ from amvnet.inference.journal import JOURNAL, UNFINISHED
 from amvnet.onnx_runner import DESCRIPTION
 from amvnet.outputs import Signature, check_outputs
 
-from fixtures.commands import (
-    fails,
-    files,
-    refusal,
-    run_cli,
-    succeed,
-)
+from fixtures.commands import fails, files, refusal, run_cli, succeed
 from fixtures.marks import with_full
 
 MINE = b"hours of work"

@@ -26,12 +26,7 @@ from amvnet.weights.file import save
 from fixtures.browser_pages import read_page
 from fixtures.commands import fails, files, succeed
 from fixtures.scan_writers import write_bag1, write_pcd
-from fixtures.tiny import (
-    fresh_weights,
-    make_streets,
-    street,
-    without,
-)
+from fixtures.tiny import fresh_weights, make_streets, street, without
 
 WEIGHTS = fresh_weights()
 POINTS = np.clip(street(3, 500)[0], -60, 60)

@@ -22,12 +22,7 @@ from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
 from amvnet.weights.file import built_in
 
-from fixtures.commands import (
-    files,
-    refusal,
-    run_cli,
-    succeed,
-)
+from fixtures.commands import files, refusal, run_cli, succeed
 from fixtures.marks import with_quick
 from fixtures.tiny import GOLDEN
 

@@ -15,12 +15,7 @@ from amvnet.weights.file import load, save
 from fixtures.commands import files
 from fixtures.pages import Changes, DocsPage, run
 from fixtures.scan_writers import write_pcd
-from fixtures.tiny import (
-    GOLDEN,
-    fresh_weights,
-    make_streets,
-    write_recipe,
-)
+from fixtures.tiny import GOLDEN, fresh_weights, make_streets, write_recipe
 
 TRAINING = DocsPage("docs/training.md")
 FINE_TUNING = DocsPage("docs/finetuning.md")

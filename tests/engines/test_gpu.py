@@ -38,12 +38,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights, save
 
-from fixtures.commands import (
-    fails,
-    files,
-    refusal,
-    run_cli,
-)
+from fixtures.commands import fails, files, refusal, run_cli
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.engines import ScriptedEngine, sure_of
 from fixtures.networks import whole_model

@@ -15,20 +15,11 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.evaluation.submission import rules_for, write_archive
 from amvnet.weights.file import save
 
-from fixtures.commands import (
-    fails,
-    files,
-    run_cli,
-)
+from fixtures.commands import fails, files, run_cli
 from fixtures.datasets import make_nuscenes
 from fixtures.pages import DocsPage
 from fixtures.submissions import TEST, Case, Entries, measured, read_entries, write_files
-from fixtures.tiny import (
-    GOLDEN,
-    fresh_weights,
-    street,
-    write_scan,
-)
+from fixtures.tiny import GOLDEN, fresh_weights, street, write_scan
 
 # --- good archives ---
 

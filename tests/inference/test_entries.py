@@ -52,12 +52,7 @@ from fixtures.datasets import make_nuscenes
 from fixtures.marks import with_full, with_quick
 from fixtures.scan_writers import cloud_message
 from fixtures.sensors import LASERS, is_on_nuscenes_car, on_nuscenes_car, place
-from fixtures.tiny import (
-    fresh_weights,
-    street,
-    without,
-    write_scan,
-)
+from fixtures.tiny import fresh_weights, street, without, write_scan
 
 try:
     import pyarrow as pa

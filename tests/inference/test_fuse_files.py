@@ -21,12 +21,7 @@ from amvnet.weights.file import load, save
 
 from fixtures.commands import files, refusal, run_cli
 from fixtures.pages import Changes, DocsPage, run
-from fixtures.tiny import (
-    fresh_weights,
-    make_simulation_quick,
-    street,
-    without,
-)
+from fixtures.tiny import fresh_weights, make_simulation_quick, street, without
 
 DOCS = Path(__file__).parents[2] / "docs"
 SCAN = "sequences/08/predictions/000000"

@@ -31,13 +31,7 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import Weights, save
 
-from fixtures.commands import (
-    fails,
-    files,
-    refusal,
-    run_cli,
-    succeed,
-)
+from fixtures.commands import fails, files, refusal, run_cli, succeed
 from fixtures.datasets import make_semantickitti
 from fixtures.marks import with_quick
 from fixtures.sensors import LASERS, place

@@ -35,13 +35,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
-from fixtures.commands import (
-    fails,
-    files,
-    refusal,
-    run_cli,
-    succeed,
-)
+from fixtures.commands import fails, files, refusal, run_cli, succeed
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.datasets import MAKERS
 from fixtures.marks import with_full

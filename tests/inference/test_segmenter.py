@@ -22,12 +22,7 @@ from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails
 from fixtures.sensors import rings_of
-from fixtures.tiny import (
-    THRESHOLD,
-    fresh_weights,
-    street,
-    without,
-)
+from fixtures.tiny import THRESHOLD, fresh_weights, street, without
 
 K = 19
 POINTS = street(5, 600)[0]

@@ -23,11 +23,7 @@ from amvnet.models.assertion import Disagreement
 from amvnet.models.layers import freeze
 from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
 from amvnet.models.neighbours import Query
-from amvnet.models.point_head import (
-    head_features,
-    nearest_neighbours,
-    point_table,
-)
+from amvnet.models.point_head import head_features, nearest_neighbours, point_table
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid
 from amvnet.scan import Scan

@@ -16,14 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import RangeNetConfig
 from amvnet.models import range_net
-from amvnet.models.layers import (
-    AzimuthGRU,
-    PointLinear,
-    RingConv2d,
-    freeze,
-    upsample,
-    wrap_width,
-)
+from amvnet.models.layers import AzimuthGRU, PointLinear, RingConv2d, freeze, upsample, wrap_width
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.upsampled_conv import _kernels, convolve_joined

@@ -15,9 +15,7 @@ from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import to_train
 from amvnet.sensors.expectation import Expectation
-from amvnet.sensors.intensity import (
-    SIMULATED_QUANTILES,
-)
+from amvnet.sensors.intensity import SIMULATED_QUANTILES
 from amvnet.sensors.normalise import Normaliser, normalised
 from amvnet.training.checking import first_weights
 from amvnet.training.expectation import expected_after, expected_before

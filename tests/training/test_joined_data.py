@@ -33,12 +33,7 @@ from amvnet.training.checking import check_data
 from amvnet.training.expectation import expected_after
 from amvnet.training.loaders import ScanSet, collate
 from amvnet.training.losses import rival_classes
-from amvnet.training.plan import (
-    Plan,
-    open_for_training,
-    sized_by_init,
-    without_initial_weights,
-)
+from amvnet.training.plan import Plan, open_for_training, sized_by_init, without_initial_weights
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.commands import refusal, run_cli, succeed

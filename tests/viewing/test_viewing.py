@@ -34,13 +34,7 @@ from fixtures.commands import files, run_cli
 from fixtures.marks import with_full
 from fixtures.pages import Changes, DocsPage, run
 from fixtures.scan_writers import write_bag1
-from fixtures.tiny import (
-    GOLDEN,
-    fresh_weights,
-    make_simulation_quick,
-    street,
-    without,
-)
+from fixtures.tiny import GOLDEN, fresh_weights, make_simulation_quick, street, without
 
 __all__ = ["browser"]
 

@@ -22,13 +22,7 @@ from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.errors import InputError
 from amvnet.models.neighbours import nearest_others
-from amvnet.onnx_runner import (
-    distances,
-    image_rows,
-    polar_features,
-    range_image,
-    scores_of_points,
-)
+from amvnet.onnx_runner import distances, image_rows, polar_features, range_image, scores_of_points
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.lidars import rotation_from_degrees

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
@@ -24,6 +24,16 @@ from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import built_in, load
 
 
+def _table(title: str | None, texts: Iterable[str], numbers: Iterable[str]) -> Table:
+    """Return an empty table, given the titles of its columns; numbers are aligned at the right."""
+    table = Table(title=title, show_edge=False)
+    for name in texts:
+        table.add_column(name)
+    for name in numbers:
+        table.add_column(name, justify="right")
+    return table
+
+
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     """Return the table of a report of `Evaluation`: a row for each class, a column for each method.
 
@@ -33,11 +43,7 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     title = f"{report['dataset']}: {counted(report['scans'], 'scan')}, {report['points']:,} points"
     if "tau" in report:
         title += f", tau: {report['tau']}"
-    table = Table(title=title, show_edge=False)
-    table.add_column("IoU in %")
-    for name in methods:
-        table.add_column(title_of(name), justify="right")
-
+    table = _table(title, ["IoU in %"], map(title_of, methods))
     for name in taxonomy.classes:
         table.add_row(name, *[_percent(method["iou"][name]) for method in methods.values()])
     table.add_section()
@@ -56,14 +62,11 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 
 def contents_table(report: Report) -> Table:
     """Return the table of the points and the scans of each class in a dataset."""
-    table = Table(title=report.spec, show_edge=False)
-    table.add_column("class")
     splits = {name: split for name, split in report.splits.items() if split.scans}
+    columns = []
     for name in splits:
-        table.add_column(f"{name}: points", justify="right")
-        table.add_column("in %", justify="right")
-        table.add_column("scans", justify="right")
-
+        columns += [f"{name}: points", "in %", "scans"]
+    table = _table(report.spec, ["class"], columns)
     names = ("ignored", *report.taxonomy.classes)
     for train_id in (*range(1, len(names)), 0):  # ignored points last
         cells = []
@@ -87,10 +90,7 @@ def labelled_table(entries: Sequence[Entry], taxonomy: Taxonomy) -> Table:
     for entry in entries:
         totals.update(dict(zip(taxonomy.names, entry.counts, strict=False)))
         totals["own car (no label)"] += entry.own
-    table = Table(show_edge=False)
-    table.add_column("class")
-    table.add_column("points", justify="right")
-    table.add_column("in %", justify="right")
+    table = _table(None, ["class"], ["points", "in %"])
     for name, points in totals.most_common():
         if points:
             table.add_row(name, f"{points:,}", _percent(points / totals.total()))
@@ -99,10 +99,7 @@ def labelled_table(entries: Sequence[Entry], taxonomy: Taxonomy) -> Table:
 
 def unknown_table(report: Report) -> Table:
     """Return the table of the ids that belong to no class and are not ignored."""
-    table = Table(title="ids of no class", show_edge=False)
-    table.add_column("id", justify="right")
-    table.add_column("points", justify="right")
-    table.add_column("scans", justify="right")
+    table = _table("ids of no class", [], ["id", "points", "scans"])
     table.add_column("for example", overflow="fold")
     for raw_id, entry in report.unknown.items():
         table.add_row(str(raw_id), f"{entry.points:,}", str(entry.scans), str(entry.example))
@@ -117,10 +114,7 @@ def timing_table(report: Mapping[str, Any]) -> Table:
         f"{counted(report['threads'], 'thread')}: {points:,} points, "
         f"{report['uncertain'] / points:.1%} of them uncertain"
     )
-    table = Table(title=title, show_edge=False)
-    for name in ("stage", "ms", "quartiles", "share"):
-        table.add_column(name, justify="left" if name == "stage" else "right")
-
+    table = _table(title, ["stage"], ["ms", "quartiles", "share"])
     stages = report["stages_ms"]
     total = report["all_ms"]
     for stage in STAGES:
@@ -187,10 +181,7 @@ def sensors_table() -> Table:
     """Return the table of the sensors that are known by name."""
     from lidarstreets import LIDAR_MODELS  # with SciPy, which `predict` does without
 
-    table = Table(title="sensors", show_edge=False)
-    table.add_column("--sensor")
-    for name in ("lasers", "up to", "down to"):
-        table.add_column(name, justify="right")
+    table = _table("sensors", ["--sensor"], ["lasers", "up to", "down to"])
     for name, sensor in KNOWN_SENSORS.items():
         table.add_row(
             name, str(sensor.beams), f"{sensor.fov_up:+g} degrees", f"{sensor.fov_down:+g} degrees"

@@ -280,7 +280,10 @@ def check_scans(
     for records in splits.values():
         for record in dataset.having_labels(records):
             labelled[record.name] = record
-    found = _find_contents(dataset, labelled, progress, processes)
+    share = processes.share(list(labelled.values()))
+    found: dict[str, Contents | str] = {}
+    for part in processes.gather(_read_all(dataset, share, progress)):
+        found |= part
 
     reports = {}
     for split, records in splits.items():
@@ -297,20 +300,6 @@ def check_scans(
 
     whole = {name: item for name, item in found.items() if isinstance(item, Contents)}
     return Report(dataset.spec, dataset.taxonomy, reports, whole)
-
-
-def _find_contents(
-    dataset: Dataset,
-    records: Mapping[str, ScanRecord],
-    progress: Progress,
-    processes: Processes,
-) -> dict[str, Contents | str]:
-    """Return the contents of scans, or the message about a broken scan, by the name of the scan."""
-    found: dict[str, Contents | str] = {}
-    share = processes.share(list(records.values()))
-    for part in processes.gather(_read_all(dataset, share, progress)):
-        found |= part
-    return found
 
 
 def describe_unknown(raw_id: int, entry: UnknownId) -> str:

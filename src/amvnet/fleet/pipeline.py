@@ -134,30 +134,24 @@ def _windows(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:
         yield pa.concat_tables(waiting)
 
 
+@dataclass(eq=False)
 class FleetRun:
     """A run over the scans of a fleet, window by window: plan, measure the drives, label.
 
-    Args:
+    Attributes:
         results: the table of results; it knows the scans that an earlier run has done.
         resources: the resources of each worker, as options of Ray.
         progress: called with the number of scans that are done, and their total so far.
     """
 
-    def __init__(
-        self,
-        request: LabellingRequest,
-        results: Results,
-        cluster: Cluster,
-        resources: dict[str, Any],
-        progress: Progress = no_progress,
-        report: Reporter = report_nothing,
-    ) -> None:
-        self.request = request
-        self.results = results
-        self.cluster = cluster
-        self.resources = resources
-        self._progress = progress
-        self._report = report
+    request: LabellingRequest
+    results: Results
+    cluster: Cluster
+    resources: dict[str, Any]
+    progress: Progress = no_progress
+    report: Reporter = report_nothing
+
+    def __post_init__(self) -> None:
         self._paths = NameSet()  # names of the files that are written
         self._names = NameSet()  # names of the scans
         self._planned = 0  # number of scans to label in all windows so far
@@ -203,11 +197,11 @@ class FleetRun:
     def _report_assumptions(self, rows: Sequence[dict[str, Any]]) -> None:
         """Report what is assumed of the sensors of some drives, given by their rows."""
         for row in rows[:REPORTED_DRIVES]:
-            self._report(row["assumed"] or f"{row['drive']}: expected scans to measure, found none")
+            self.report(row["assumed"] or f"{row['drive']}: expected scans to measure, found none")
         more = len(rows) - REPORTED_DRIVES
         if more > 0:
             place = self.results.folder / DRIVES
-            self._report(f"what is assumed of {more} more drives is in {place.url}")
+            self.report(f"what is assumed of {more} more drives is in {place.url}")
 
     def label(self, scans: pa.Table) -> None:
         """Label scans of drives that are measured.
@@ -247,7 +241,7 @@ class FleetRun:
             raise OSError(errno.EIO, reason, place)
 
         self._done += len(rows)
-        self._progress(self._done, self._planned)
+        self.progress(self._done, self._planned)
 
     def _rows_of_lost(self, scans: pa.Table) -> pa.Table:
         """Return the rows of scans that end every worker that reads them."""
@@ -329,7 +323,7 @@ class FleetRun:
 
         usual = self.request.weights.usual_uncertain_at(self.request.tau)
         drives = [Entry("", "", drive, points[drive], uncertain[drive], []) for drive in points]
-        report_certainty(drives, self.request.method, usual, self._report)
+        report_certainty(drives, self.request.method, usual, self.report)
         check_faults(faults, len(self._names))
         return written
 

@@ -17,12 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from amvnet.data.formats.registry import COLUMN_READERS
-from amvnet.data.labels.writers import (
-    SCORES,
-    SIGNATURES,
-    UNCERTAIN,
-    write_uncertain,
-)
+from amvnet.data.labels.writers import SCORES, SIGNATURES, UNCERTAIN, write_uncertain
 from amvnet.errors import InputError, SomeBroken, memory_for
 from amvnet.files import alone_in, atomic_write, inside
 from amvnet.inference.drive import Drives

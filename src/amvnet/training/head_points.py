@@ -42,43 +42,33 @@ Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]
 HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
+@dataclass(eq=False)
 class HeadPoints:
     """The labelled uncertain points of some scans on disk, and statistics of all labelled points.
 
-    Args:
+    Attributes:
         paths: the files of the points, one for each process that scored scans.
         dtype: the type of a point in the files.
         files: (U,) index of each point's file. The points of a file are in the same order here.
         labels: (U,) train ids of the points.
         certain: (K + 1, K + 1) confusion matrix of the ensemble over the certain points.
         uncertain_share: share of the labelled points that are uncertain, in [0, 1].
-
-    Attributes:
         are_uncertain: whether the points are uncertain. If the networks agree everywhere, they are
             points of all kinds, for which AMVNet takes the labels of the ensemble.
     """
 
-    def __init__(
-        self,
-        paths: Sequence[Path],
-        dtype: np.dtype,
-        files: np.ndarray,
-        labels: np.ndarray,
-        *,
-        certain: np.ndarray,
-        uncertain_share: float,
-    ) -> None:
-        self.paths = paths
-        self.dtype = dtype
-        self.labels = labels
-        self.certain = certain
-        self.uncertain_share = uncertain_share
-        self.are_uncertain = True
+    paths: Sequence[Path]
+    dtype: np.dtype
+    files: np.ndarray
+    labels: np.ndarray
+    certain: np.ndarray
+    uncertain_share: float
+    are_uncertain: bool = True
 
-        self._files = files
-        self._rows = np.empty(len(files), dtype=np.int64)  # the place of each point in its file
-        for number in range(len(paths)):
-            is_here = files == number
+    def __post_init__(self) -> None:
+        self._rows = np.empty(len(self.files), np.int64)  # the place of each point in its file
+        for number in range(len(self.paths)):
+            is_here = self.files == number
             self._rows[is_here] = np.arange(np.count_nonzero(is_here))
 
     def __len__(self) -> int:
@@ -87,7 +77,7 @@ class HeadPoints:
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
         points = np.empty(len(index), dtype=self.dtype)
         for number, path in enumerate(self.paths):
-            is_here = self._files[index] == number
+            is_here = self.files[index] == number
             if is_here.any():
                 on_disk = np.memmap(path, self.dtype, "r")
                 points[is_here] = on_disk[self._rows[index[is_here]]]

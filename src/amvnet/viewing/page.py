@@ -30,13 +30,7 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
 from amvnet.outputs import Signature, check_outputs
 from amvnet.scan import AnyArray, Scan
-from amvnet.viewing.shown_scans import (
-    RIGHT,
-    UNSCORED,
-    ShownScan,
-    short_name,
-    shown_scan,
-)
+from amvnet.viewing.shown_scans import RIGHT, UNSCORED, ShownScan, short_name, shown_scan
 
 # Largest number of points of a scan that the page shows. The page shows every second or third point
 # of a larger scan, so that phones keep up.

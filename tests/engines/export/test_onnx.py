@@ -30,18 +30,10 @@ from amvnet.engines.export.onnx import describe_export
 from amvnet.models.methods import MethodName
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, OnnxSegmenter
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import (
-    SIMULATED_QUANTILES,
-)
+from amvnet.sensors.intensity import SIMULATED_QUANTILES
 from amvnet.weights.file import Weights, save
 
-from fixtures.commands import (
-    fails,
-    files,
-    refusal,
-    run_cli,
-    succeed,
-)
+from fixtures.commands import fails, files, refusal, run_cli, succeed
 from fixtures.examples import first_of
 from fixtures.exports import shallow_weights
 from fixtures.pages import DocsPage

@@ -56,12 +56,12 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     Raises:
         InputError: if the file is broken, or needs a package that is missing.
     """
-    with readable(path):
-        if ending == GZIP:
-            return Cloud(**_call(read_gzip, path, ending, *_to_json(layout)))
-        if ending in ROW_READERS:
-            return ROW_READERS[ending](path, layout)
-        return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
+    if ending == GZIP:
+        return Cloud(**_call(read_gzip, path, ending, list(layout.columns), list(layout.dtypes)))
+    if ending in ROW_READERS:
+        cloud: Cloud = _call(ROW_READERS[ending], path, ending, layout)
+        return cloud
+    return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
 
 
 def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
@@ -75,10 +75,6 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     """
     columns: Arrays = _call(COLUMN_READERS[ending], path, ending, wanted)
     return columns
-
-
-def _to_json(layout: RowLayout) -> tuple[list[str], list[str]]:
-    return list(layout.columns), list(layout.dtypes)
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
@@ -113,12 +109,10 @@ def check_packages(place: object, ending: str) -> None:
 
 def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any) -> Any:
     """Call a function that reads a file; the process with limits runs it if `PACKAGES` says so."""
-    if ending not in PACKAGES:
-        return function(path, *arguments)
-
     check_packages(path, ending)
+    read = partial(call, function) if ending in PACKAGES else function
     with readable(path):
-        return call(function, path, *arguments)
+        return read(path, *arguments)
 
 
 # --- in the process with limits ---
@@ -146,9 +140,5 @@ def _open(path: Path, ending: str, topic: str | None, _opening: str) -> Bag:
 
 def read_gzip(path: Path, columns: list[str], dtypes: list[str]) -> dict[str, Any]:
     """Return the attributes of the cloud in a file that is packed by gzip."""
-    return vars(packed.read_gzip(path, _reader(columns, dtypes)))
-
-
-def _reader(columns: list[str], dtypes: list[str]) -> Callable[[Path, str], Cloud]:
     layout = RowLayout(tuple(columns), tuple(dtypes))
-    return partial(read_file, layout=layout)
+    return vars(packed.read_gzip(path, partial(read_file, layout=layout)))
