@@ -237,17 +237,6 @@ def test_the_users_labels_are_not_replaced_by_those_of_other_classes(
     assert contents(tmp_path) == before
 
 
-def test_a_scan_is_not_replaced_by_its_page(world: Path, tmp_path: Path) -> None:
-    scan = shutil.copy(world / "pair/a.bin", tmp_path)
-    page = tmp_path / "a.html"
-    page.symlink_to(scan)
-    command = f"view {scan} {WEIGHTS} --html {page}".format(world=world)
-    for option in ("", " --overwrite"):
-        assert "found the input" in refusal(command + option)
-    assert page.is_symlink()
-    assert Path(scan).read_bytes() == (world / "pair/a.bin").read_bytes()
-
-
 def test_a_labelled_scan_is_not_replaced_by_labels_from_another_folder(
     world: Path, tmp_path: Path
 ) -> None:
