@@ -21,7 +21,7 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (few,) = [text for text in OWN_DATA.blocks("yaml") if "from:" in text]
     Path("few.yaml").write_text(few)  # the page links to it
     run(PAGE.commands, CHANGES)
-    assert len(list(Path("labels").rglob("*.label"))) == 3
+    assert len(list(Path("drive_labels").rglob("*.label"))) == 3
     assert Path("map.html").stat().st_size
 
     variables = execute(PAGE.blocks("python"))

@@ -58,7 +58,7 @@ def test_every_command_of_the_page_runs(
 
     # The files, their folder and the dataset get the same labels, in the user's own ids.
     for path in sorted(Path("robot/site_d/clouds").glob("*.pcd")):
-        of_dataset = np.fromfile(f"labels/site_d/clouds/{path.stem}.label", np.uint32)
+        of_dataset = np.fromfile(f"labels_of_val/site_d/clouds/{path.stem}.label", np.uint32)
         of_folder = np.fromfile(f"labels_of_files/{path.stem}.label", np.uint32)
         assert set(of_dataset.tolist()) <= {raw for raw, _ in CLASSES.values()} | {65535}
         np.testing.assert_array_equal(of_dataset, of_folder)

@@ -202,7 +202,7 @@ def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_f
     )
     assumed, advice = lines  # a guess about one's own sensor is no secret
     assert "assumed intensity" in assumed
-    assert "state under sensor" in advice
+    assert "under sensor" in advice
     records = first.records(first.sequences("all"))
 
     data = TrainingData([Source(first, records), to_mix_in(second)])

@@ -249,9 +249,10 @@ def find_poses(
         sources.setdefault(scan.source, []).append(scan)
     is_file = path is not None and path.is_file()
     if (is_file or is_one) and len(sources) > 1:
+        more = ", ..." if len(sources) > 3 else ""
         raise InputError(
             f"expected the scans of one drive, found {len(sources)} recordings "
-            f"({', '.join(list(sources)[:3])}, ...); choose one, with --sequences or as INPUT"
+            f"({', '.join(list(sources)[:3])}{more}); choose one, with --sequences or as INPUT"
         )
     for source, members in sources.items():
         if len(members) < LEAST_SCANS:

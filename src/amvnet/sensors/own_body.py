@@ -29,10 +29,10 @@ def own_points(xyz: np.ndarray, ring: np.ndarray | None, sensor: Sensor) -> np.n
     if sensor.keep_own:
         return None
     if sensor.own_body is not None:
-        return _inside(xyz, sensor.own_body)
+        return is_inside(xyz, sensor.own_body)
 
     for name, box in KNOWN_BODIES.items():
-        own = _inside(xyz, box)
+        own = is_inside(xyz, box)
         if own.mean() >= LEAST_OWN:
             part = xyz[::QUICK_STEP, :3]  # enough to know the lasers
             placed = np.isfinite(part).all(axis=1)
@@ -50,7 +50,7 @@ def mark_own(scan: Scan, sensor: Sensor) -> Scan:
     return dataclasses.replace(scan, own=own_points(scan.points, scan.ring, sensor))
 
 
-def _inside(xyz: np.ndarray, box: Box) -> np.ndarray:
+def is_inside(xyz: np.ndarray, box: Box) -> np.ndarray:
     """Return (N,) bool: which points lie in a box."""
     inside: np.ndarray = np.ones(len(xyz), dtype=bool)
     for axis in range(3):

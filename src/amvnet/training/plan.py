@@ -196,7 +196,7 @@ def without_initial_weights(
 ) -> Recipe:
     """Return the recipe without averages and distillation of initial weights of other classes.
 
-    A line reports this for each of the stages that are trained.
+    A line reports this for the stages that are trained.
 
     Their last layers would then be replaced by new ones, which are useless in an average, and
     teach nothing.
@@ -204,16 +204,19 @@ def without_initial_weights(
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
 
-    difference = describe_difference(init.taxonomy.classes, classes.classes, "data")
     networks = {}
+    changed = []
     for name in ("rv", "bev"):
         config = getattr(recipe.training, name)
         if name in stages and (config.initial or config.distill):
-            report(
-                f"{name}: --init has other classes ({difference}), so the result is not averaged "
-                "with --init (initial), and keeps no probabilities of --init (distill)"
-            )
+            changed.append(name)
         networks[name] = dataclasses.replace(config, initial=0.0, distill=0.0)
+    if changed:
+        difference = describe_difference(init.taxonomy.classes, classes.classes, "data")
+        report(
+            f"{' and '.join(changed)}: begin with --init, but because its classes are others "
+            f"({difference}), they are neither averaged with it (initial) nor taught by it (distill)"
+        )
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
 
@@ -261,7 +264,7 @@ def _report_recordings(dataset: Dataset, normaliser: Normaliser, report: Reporte
             normaliser(scans[0].read(), source)
     more = len(recordings) - MAX_MEASURED_RECORDINGS
     rest = f"; {counted(more, 'further recording')} not shown" if more > 0 else ""
-    report(f"{dataset.spec}: state under sensor what is assumed wrongly{rest}")
+    report(f"{dataset.spec}: if an assumption is wrong, state the right value under sensor{rest}")
     normaliser.quiet()
 
 

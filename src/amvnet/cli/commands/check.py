@@ -18,24 +18,33 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     """Check the labels of all scans to train on, to validate with and to test on.
 
     If there are too few sequences for a training, their labels are checked before this is said.
+    Of scans that a YAML file describes, the body of the car is measured, too.
 
     Args:
         data: the dataset.
         choice: which scans to check in addition to the labelled scans of the test split.
     """
     from amvnet.data.datasets.open import open_dataset
+    from amvnet.sensors.measure_body import measure_body
     from amvnet.sensors.normalise import described_sensor
 
     dataset = open_dataset(data)
-    described_sensor(dataset)  # raises if there is no such sensor
+    recordings = dataset.recordings().values()
+    scans = [scan.read for recording in recordings for scan in recording]
+    body = measure_body(scans, described_sensor(dataset))
+    if body is not None:
+        report(
+            f"{body.share:.0%} of the points move with the sensor, so they are the car itself; "
+            f"to give them no label, state under sensor: own_body: {list(body.box)}"
+        )
     try:
         splits = choice.splits(dataset)
     except InputError:
         if choice == TrainingChoice():  # the error is not about names that the user gave
             _check(dataset, {"all": dataset.records(dataset.trainable())})
         raise
-    scans = _check(dataset, splits)
-    report(f"{counted(scans, 'scan')} can be trained on or scored")
+    usable = _check(dataset, splits)
+    report(f"{counted(usable, 'scan')} can be trained on or scored")
 
 
 def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanRecord]]) -> int:
