@@ -196,10 +196,8 @@ def without_initial_weights(
 ) -> Recipe:
     """Return the recipe without averages and distillation of initial weights of other classes.
 
-    A line reports this for the stages that are trained.
-
     Their last layers would then be replaced by new ones, which are useless in an average, and
-    teach nothing.
+    teach nothing. A line reports this for the stages that are trained.
     """
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
@@ -215,7 +213,8 @@ def without_initial_weights(
         difference = describe_difference(init.taxonomy.classes, classes.classes, "data")
         report(
             f"{' and '.join(changed)}: begin with --init, but because its classes are others "
-            f"({difference}), they are neither averaged with it (initial) nor taught by it (distill)"
+            f"({difference}), they are neither averaged with it (initial) nor taught by it "
+            "(distill)"
         )
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
