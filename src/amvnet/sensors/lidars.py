@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.config.yaml_files import read_yaml
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
 
 # Heights of the sensors over the ground on the cars that recorded KITTI and nuScenes, metres.
@@ -226,6 +225,8 @@ def _read_sensor(text: str) -> Sensor:
             f"expected a sensor of {', '.join(KNOWN_SENSORS)} or a YAML file, found {shown(text)}"
             f"{did_you_mean(text, KNOWN_SENSORS, 'give one of them')}"
         )
+
+    from amvnet.config.yaml_files import read_yaml  # here, because onnx_runner needs no PyYAML
 
     tree = read_yaml(path, "a description of a sensor")
     if not isinstance(tree, Mapping):
