@@ -111,6 +111,24 @@ def test_rings_in_any_order_become_the_lasers(seed: int, tilt: float) -> None:
         assert order_rings(scan) == (scan, "")
 
 
+@pytest.mark.parametrize("near", [0, 7, LASERS - 1])
+def test_a_laser_that_sees_only_the_car_has_its_place(near: int) -> None:
+    points, laser = turns()
+    is_near = laser == near
+    points[is_near, :3] *= 0.9 / np.hypot(*points[is_near, :2].T)[:, None]
+    points[np.flatnonzero(is_near)[:3], :2] = 0  # on the axis, where no elevation shows
+    other = np.random.default_rng(0).permutation(LASERS)
+    for ring in (laser, LASERS - 1 - laser, other[laser]):
+        scan, _ = order_rings(Scan(points, ring=ring))
+        np.testing.assert_array_equal(scan.ring, laser)
+
+    points[is_near, :2] = 0
+    for ring in (LASERS - 1 - laser, other[laser]):
+        scan, _ = order_rings(Scan(points, ring=ring))
+        assert scan.ring is not None
+        assert sorted(set(scan.ring.tolist())) == list(range(LASERS))
+
+
 def test_the_lowest_laser_is_the_last_ring_although_the_highest_see_nothing() -> None:
     points, laser = turns()
     seen = laser < LASERS - 3

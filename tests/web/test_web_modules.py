@@ -4,29 +4,43 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pytest
 
+from amvnet import onnx_runner
+from amvnet import scan as scans
+from amvnet.config import schema
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import PolarViewConfig
+from amvnet.data.formats import cloud, fields, pcd, raw, rows
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.errors import InputError
+from amvnet.inference import segmentation
+from amvnet.models import assertion
 from amvnet.models.neighbours import nearest_others
+from amvnet.models.views import polar_view
 from amvnet.onnx_runner import distances, image_rows, polar_features, range_image, scores_of_points
 from amvnet.scan import Scan
+from amvnet.sensors import frame, ground, intensity, laser_order, lasers, own_body
+from amvnet.sensors import normalise as normalising
 from amvnet.sensors.expectation import Expectation
+from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
+from amvnet.sensors.laser_order import lasers_by_order
 from amvnet.sensors.lidars import rotation_from_degrees
 from amvnet.sensors.normalise import Normaliser
+from amvnet.weights import verdict
 from amvnet.weights.file import load
 
 from fixtures.marks import with_quick
@@ -39,7 +53,7 @@ PAGE = Path(__file__).parents[2] / "web"
 DRIVER = Path(__file__).parents[1] / "fixtures" / "web_modules.mjs"
 FORMATS = ("kitti.bin", "ascii.pcd", "binary.pcd", "compressed.pcd", "ascii.ply", "little.ply")
 # The page chooses among its own weights, so it names no built-in ones.
-NO_OTHERS = "; no built-in weights have"
+NO_OTHERS = re.compile("; (no built-in weights have|[^;]* would fit)$")
 POLAR = PolarViewConfig(radial=40, angular=36, vertical=8)
 NEIGHBOURS = 15
 K = 3  # number of classes whose scores are made up
@@ -52,11 +66,12 @@ pytestmark = pytest.mark.skipif(NODE is None, reason="Node.js is not installed")
 
 @dataclass(frozen=True)
 class Case:
-    """A scan file, the weights that it is normalised for, and what their rows are, if changed."""
+    """A scan file, the weights that it is normalised for, and what of them is changed."""
 
     file: Path
     weights: str = "sim-hdl64e"
     rows: Literal["elevation", "laser", "ring"] | None = None
+    intensity: TrainedIntensity | None = None
 
     @property
     def expected(self) -> Expectation:
@@ -65,7 +80,8 @@ class Case:
         rows = self.rows or view.rows
         # Coarse images have hidden points.
         view = dataclasses.replace(view, rows=rows, width=view.width // 8, hidden=0.02)
-        return dataclasses.replace(expected, view=view)
+        intensity = self.intensity or expected.intensity
+        return dataclasses.replace(expected, view=view, intensity=intensity)
 
 
 def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
@@ -197,6 +213,43 @@ def with_permuted_rings(folder: Path) -> Case:
     return Case(path, "sim-hdl32e", rows="laser")
 
 
+def with_a_laser_that_sees_only_the_car(
+    near: int, order: Callable[[np.ndarray], np.ndarray], folder: Path
+) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    points[laser == near, :2] *= 0.9 / np.hypot(*points[laser == near, :2].T)[:, None]
+    path = write_bin(folder / "near.pcd.bin", with_ring(points, order(laser)))
+    return Case(path, "sim-hdl32e", rows="laser")
+
+
+def of_more_lasers(folder: Path) -> Case:
+    points, laser = place(np.linspace(-30.67, 10.67, 48), 1.84, steps=700)
+    path = write_bin(folder / "lasers48.pcd.bin", with_ring(points, laser))
+    return Case(path, "sim-hdl32e", rows="laser")
+
+
+def of_half_the_lasers(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    ring = laser // 2  # as of 16 lasers between the same elevations
+    path = write_bin(folder / "half.pcd.bin", with_ring(points, ring))
+    return Case(path, "sim-hdl32e", rows="laser")
+
+
+def on_a_tilted_sensor(folder: Path) -> Case:
+    """The lasers keep to their elevations in the file, and not when the ground is level."""
+    points, laser = place(HDL64E, 1.73, slope=8)
+    points = by_laser(points, laser)
+    return Case(write_bin(folder / "slope.bin", points), rows="laser")
+
+
+def for_weights_that_match_nothing(
+    make: Callable[[Path], Case], is_optional: bool, folder: Path
+) -> Case:
+    """Change the intensities that the weights know; scans like theirs stay unchanged."""
+    quantiles = tuple((np.linspace(0, 1, len(PROBABILITIES)) ** 2).tolist())
+    return dataclasses.replace(make(folder), intensity=TrainedIntensity(quantiles, is_optional))
+
+
 def with_a_ring_of_a_few_points(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
     laser[np.flatnonzero(laser == 0)[:5]] = 31
@@ -227,9 +280,16 @@ def gather(points: np.ndarray) -> np.ndarray:
     return points
 
 
+def from_the_lowest(points: np.ndarray) -> np.ndarray:
+    ring = lasers_by_order(points, 64)
+    assert ring is not None
+    return points[np.argsort(ring, kind="stable")]
+
+
 CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "tilted_in_order": tilt,
     "in_reverse": lambda points: points[::-1],
+    "from_the_lowest": from_the_lowest,
     "mirrored": lambda points: points * [1, -1, 1, 1],
     "glued": lambda points: np.concatenate([points, points * [-1, -1, 1, 1]]),
     "coincident": gather,
@@ -341,6 +401,9 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     with_rings_from_the_highest,
     with_permuted_rings,
     with_a_ring_of_a_few_points,
+    of_more_lasers,
+    of_half_the_lasers,
+    on_a_tilted_sensor,
     with_random_rings,
     without_rings,
     tilted,
@@ -357,8 +420,17 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
 )
 
 
-MAKERS = {make.__name__: make for make in SCANS}
+MAKERS: dict[str, Callable[[Path], Case]] = {make.__name__: make for make in SCANS}
 MAKERS |= {name: partial(changed, change) for name, change in CHANGES.items()}
+RING_ORDERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "reversed": lambda laser: 31 - laser,
+    "permuted": lambda laser: np.random.default_rng(0).permutation(32)[laser],
+}
+for near, (name, order) in product((0, 9), RING_ORDERS.items()):
+    MAKERS[f"near_{near}_{name}"] = partial(with_a_laser_that_sees_only_the_car, near, order)
+for make, is_optional in product((kitti_like, without_intensity, bright), (False, True)):
+    name = f"other_{make.__name__}_{is_optional}"
+    MAKERS[name] = partial(for_weights_that_match_nothing, make, is_optional)
 WITH_VIEWS = ("kitti_like", "nuscenes_like", "higher_with_lost_returns")
 Made = tuple[Case, dict[str, Any]]  # a scan, and what the page makes of it
 
@@ -382,11 +454,13 @@ def test_a_scan_is_normalised_as_by_the_package(name: str, made: Callable[[str],
     case, page = made(name)
     scan, line = normalised(case)
     valid = scan.valid
-    assert page["text"] == line.removesuffix(NO_OTHERS)
+    assert page["text"] == NO_OTHERS.sub("", line)
 
     points = page["points"].reshape(-1, 4)
     assert np.array_equal(page["places"], np.flatnonzero(valid))
     assert np.allclose(points[:, :3], scan.points[valid, :3], atol=1e-4)
+    prepared = case.expected.prepare(scan).points[valid]
+    assert np.allclose(points[:, 3], prepared[:, 3], atol=1e-5)
     assert (rows_of(case, scan) == page["rows"]).mean() > 0.9995
 
 
@@ -450,6 +524,104 @@ def test_few_points_are_repeated_as_neighbours(count: int, tmp_path: Path) -> No
     assert np.array_equal(page["neighbours"], expected[0])
 
 
+# The numbers of the modules as the package has them; the page's own ones are left out.
+NUMBERS: dict[str, dict[str, float]] = {
+    "method/fusion.js": {"TINY": assertion.TINY},
+    "method/head.js": {"PART": onnx_runner.HEAD_BATCH},
+    "method/networks.js": {"FORMAT": onnx_runner.FORMAT},
+    "method/polar_view.js": {"FEATURES": polar_view.FEATURES},
+    "method/range_view.js": {
+        "CHANNELS": onnx_runner.CHANNELS,
+        "OWN_WEIGHT": onnx_runner.OWN_WEIGHT,
+    },
+    "method/verdict.js": {"FEW": verdict.FEW_UNCERTAIN, "SMALLEST": segmentation.SMALLEST},
+    "reading/cloud.js": {"MAX_MISSING": cloud.MAX_MISSING_SHARE, "MAX_RINGS": cloud.MAX_RINGS},
+    "reading/fields.js": {"LONGEST_HEADER": fields.HEADER},
+    "reading/pcd.js": {
+        "LONGEST_REPETITION": pcd.LONGEST_REPETITION,
+        "REPETITION_CODE": pcd.REPETITION_CODE,
+    },
+    "reading/raw.js": {
+        "KITTI": raw.KITTI_COLUMNS,
+        "NUSCENES": raw.NUSCENES_COLUMNS,
+        "FEWEST_BYTES": raw.FEWEST_BYTES,
+        "LARGEST_INTENSITY": raw.MAX_INTENSITY,
+        "NEAR": raw.NEAR,
+        "NO_INTENSITY": raw.NO_INTENSITY,
+        "USUAL_SHARE": raw.USUAL_SHARE,
+        "LARGEST_RING": rows.LARGEST_RING,
+        "FEWEST_LASERS": rows.FEWEST_LASERS,
+        "ELEVATION_SPREAD": rows.ELEVATION_SPREAD,
+    },
+    "sensor/frame.js": {
+        "FARTHEST_MEDIAN": frame.MAX_METRES_MEDIAN,
+        "LEAST_MILLIMETRES": frame.MIN_MILLIMETRES_MEDIAN,
+        "AROUND": frame.AROUND_SHARE,
+        "SAME_TILT": frame.SAME_TILT,
+        "SAME_HEIGHT": frame.SAME_HEIGHT,
+        "LOWEST": frame.ON_GROUND_HEIGHT,
+        "HIGHEST": frame.MAX_SENSOR_HEIGHT,
+    },
+    "sensor/ground.js": {
+        "NEAREST": ground.MIN_DISTANCE,
+        "CELL": ground.CELL_SIDE,
+        "RADIUS": ground.MAX_DISTANCE,
+        "HALF_WEIGHT": ground.HALF_WEIGHT,
+        "TRIES": ground.TRIED_PLANES,
+        "LEAST_AREA": ground.MIN_AREA,
+        "TOLERANCE": ground.TOLERANCE,
+        "STEEPEST": ground.MAX_SLOPE,
+        "LEAST_CELLS": ground.MIN_CELLS,
+        "LEAST_AGREEMENT": ground.MIN_AGREEMENT,
+        "NEAR_CELLS": ground.NEAR_CELLS,
+        "MAX_NEAR_OFF": ground.MAX_NEAR_OFF,
+        "OFF_PLANE": ground.MAX_OFF_PLANE,
+        "CURVED": ground.OFF_PLANE_PER_METRE,
+        "MAX_BELOW": ground.MAX_BELOW,
+        "LOWEST": ground.MIN_HEIGHT,
+        "HIGHEST": ground.MAX_HEIGHT,
+        "SURE_AGREEMENT": ground.SURE_AGREEMENT,
+        "SURE_CELLS": ground.SURE_CELLS,
+        "SURE_SHARE": ground.SURE_SHARE,
+    },
+    "sensor/intensity.js": {
+        "DARKEST": intensity.DARKEST_INTENSITY,
+        "ALIKE": intensity.ALIKE_FACTOR,
+        "CONSTANT": intensity.CONSTANT_SHARE,
+    },
+    "sensor/normalise.js": {
+        "FARTHEST": scans.FARTHEST,
+        "LEAST_POINTS": lasers.MIN_POINTS,
+        "LEAST_OWN": own_body.LEAST_OWN,
+        "SAME_BEAMS": lasers.SAME_BEAMS,
+    },
+    "sensor/rows.js": {
+        "OUTSIDE": normalising.MAX_OUTSIDE_SHARE,
+        "SAME_ANGLE": lasers.SAME_ANGLE,
+        "LASERS_SEEN": schema.MIN_LASERS_SEEN,
+        "SLOPE_SPREAD": laser_order.SLOPE_SPREAD,
+        "MAX_RING_SPREAD": laser_order.MAX_RING_SPREAD,
+        "LEAST_RING_POINTS": laser_order.MIN_RING_POINTS,
+        "SAME_ELEVATION": laser_order.SAME_ELEVATION,
+        "LEAST_POINTS": laser_order.MIN_POINTS,
+    },
+}
+OWN_NUMBERS = {"MAX_POINTS", "LEAF", ("method/networks.js", "PART")}
+
+
+def test_the_numbers_of_the_modules_are_those_of_the_package() -> None:
+    """Scans that show each of them would be many."""
+    found: dict[str, dict[str, float]] = {}
+    for path in sorted(PAGE.glob("*/*.js")):
+        module = path.relative_to(PAGE).as_posix()
+        if module.startswith("node_modules"):
+            continue
+        for name, value in re.findall(r"\b([A-Z][A-Z_]+) = (-?\d[\d._e-]*)[,;]", path.read_text()):
+            if not OWN_NUMBERS & {name, (module, name)}:
+                found.setdefault(module, {})[name] = float(value.replace("_", ""))
+    assert found == NUMBERS
+
+
 READ = [name for name in WRITERS if name.endswith((".bin", ".pcd", ".ply"))]
 
 
@@ -459,7 +631,7 @@ def test_formats_give_the_points_of_the_package(name: str, tmp_path: Path) -> No
     case = Case(tmp_path / name)
     (page,) = run_page([case], tmp_path)
     scan, line = normalised(case)
-    assert page["text"] == line.removesuffix(NO_OTHERS)
+    assert page["text"] == NO_OTHERS.sub("", line)
     assert np.allclose(page["points"].reshape(-1, 4)[:, :3], scan.points[:, :3], atol=1e-6)
 
 
@@ -477,7 +649,7 @@ def test_integers_of_any_size_are_read(tmp_path: Path) -> None:
     case = Case(path, "sim-hdl32e")
     (page,) = run_page([case], tmp_path)
     scan, line = normalised(case)
-    assert page["text"] == line.removesuffix(NO_OTHERS)
+    assert page["text"] == NO_OTHERS.sub("", line)
     assert "32 lasers" in line
     assert np.array_equal(page["rows"], rows_of(case, scan))
 

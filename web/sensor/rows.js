@@ -55,13 +55,14 @@ export function rowsOf(points, tilted, ring, lasers, { view, sensor, as_is: isAs
  */
 export function orderRings(points, ring) {
   if (!ring) return { ring, fault: "" };
-  const used = [];
-  ring.forEach((index, i) => {
+  const seen = Array.from(ring, (index, i) => {
     const [x, y, z] = points.subarray(4 * i, 4 * i + 3), radius = Math.hypot(x, y);
-    if (radius > NEAREST) used.push({ index, waves: [x / radius, y / radius], elevation: elevationOf(x, y, z) });
+    return { index, radius, waves: [x / radius, y / radius], elevation: elevationOf(x, y, z) };
   });
-  const counts = new Map();
-  for (const { index } of used) counts.set(index, (counts.get(index) ?? 0) + 1);
+  const countsOf = (some) => some.reduce((counts, { index }) => counts.set(index, (counts.get(index) ?? 0) + 1), new Map());
+  const distant = countsOf(seen.filter(({ radius }) => radius > NEAREST));
+  // The place of a laser that sees only the car is that of these points.
+  const used = seen.filter(({ index, radius }) => radius > NEAREST || (!distant.has(index) && radius > 0)), counts = countsOf(used);
   if (counts.size < 2 || used.length < LEAST_RING_POINTS * counts.size) return { ring, fault: "" };
 
   const meansOf = (valueOf) => {
@@ -88,12 +89,14 @@ export function orderRings(points, ring) {
   }
 
   const occurring = [...counts.keys()].sort((a, b) => a - b);
-  const ascending = occurring.filter((index) => counts.get(index) >= LEAST_RING_POINTS).map((index) => means.get(index));
+  const ascending = occurring.filter((index) => distant.get(index) >= LEAST_RING_POINTS).map((index) => means.get(index));
   if (!falls(ascending)) return { ring, fault: "" };
-  const isReversed = !falls(ascending.map((value) => -value)), byElevation = [...occurring].sort((a, b) => means.get(a) - means.get(b));
-  const lasers = new Map(occurring.map((index, place) => isReversed ? [index, occurring.at(-1) - index] : [byElevation[place], index]));
+  const isReversed = !falls(ascending.map((value) => -value)), highest = Math.max(...new Set(ring));
+  const byElevation = [...occurring].sort((a, b) => means.get(a) - means.get(b));
+  const lasers = new Map(byElevation.map((index, place) => [index, occurring[place]]));
+  const laserOf = (index) => isReversed ? highest - index : lasers.get(index) ?? index;
   const known = isReversed ? "rings that count from the highest laser" : "rings in another order than the elevations";
-  return { ring: Int32Array.from(ring, (index) => lasers.get(index) ?? -1), fault: `${known} (put in order)` };
+  return { ring: Int32Array.from(ring, laserOf), fault: `${known} (put in order)` };
 }
 
 /** Return whether an elevation lies clearly below an earlier one. */

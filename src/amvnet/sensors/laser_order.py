@@ -77,27 +77,32 @@ def order_rings(scan: Scan) -> tuple[Scan, str]:
         return scan, ""
     is_known = scan.valid & (ring >= 0)
     xyz = scan.points[is_known, :3].astype(np.float64)
-    is_distant = np.hypot(xyz[:, 0], xyz[:, 1]) > MIN_DISTANCE
-    index = ring[is_known][is_distant]
-    count = np.bincount(index)
-    occurring = np.flatnonzero(count)
-    if len(occurring) < 2 or len(index) < MIN_RING_POINTS * len(occurring):
+    index = ring[is_known]
+    radius = np.hypot(xyz[:, 0], xyz[:, 1])
+    is_distant = radius > MIN_DISTANCE
+    count = np.bincount(index[is_distant], minlength=ring.max(initial=-1) + 1)
+    # The place of a laser that sees only the car is that of these points.
+    is_used = is_distant | (count[index] == 0) & (radius > 0)
+    used = index[is_used]
+    occurring = np.unique(used)
+    if len(occurring) < 2 or len(used) < MIN_RING_POINTS * len(occurring):
         return scan, ""  # too few to contradict the rings
 
-    means, is_steady = _elevations_of_rings(xyz[is_distant], index)
+    means, is_steady = _elevations_of_rings(xyz[is_used], used)
     if not is_steady:
         return replace(scan, ring=None), "rings that do not follow the elevations (not used)"
 
-    ascending = means[count >= MIN_RING_POINTS]
+    ascending = means[occurring[count[occurring] >= MIN_RING_POINTS]]
     if not _falls(ascending):
         return scan, ""
-    lasers = np.full(ring.max() + 2, -1)  # the last one is for -1
+    lasers = np.arange(ring.max() + 2)
     if _falls(-ascending):
         lasers[occurring[np.argsort(means[occurring])]] = occurring
         fault = "rings in another order than the elevations (put in order)"
     else:
-        lasers[occurring] = occurring[-1] - occurring
+        lasers = np.maximum(index.max() - lasers, -1)
         fault = "rings that count from the highest laser (put in order)"
+    lasers[-1] = -1  # for -1
     return replace(scan, ring=lasers[ring]), fault
 
 
