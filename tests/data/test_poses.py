@@ -19,7 +19,11 @@ from fixtures.commands import fails
 from fixtures.drives import TO_CAMERA, drive_poses, write_drive
 from fixtures.tiny import GOLDEN
 
-POSES = drive_poses()
+# They rise and are tilted, so that no axis is like another and no two motions commute.
+WORLD = np.eye(4)
+WORLD[:3, :3] = Rotation.from_euler("xyz", [20, -30, 70], degrees=True).as_matrix()
+WORLD[:3, 3] = (3, -2, 5)
+POSES = WORLD @ drive_poses()
 
 
 def write_tum(path: Path, poses: np.ndarray = POSES, first: float = 100.0) -> Path:
@@ -39,9 +43,19 @@ def write_numpy(path: Path, poses: np.ndarray = POSES) -> Path:
     return path.with_suffix(".npy")
 
 
-@pytest.mark.parametrize("write", [write_kitti, write_tum, write_numpy])
+def write_rows(path: Path, poses: np.ndarray = POSES) -> Path:
+    return write_numpy(path, poses[:, :3])
+
+
+@pytest.mark.parametrize("write", [write_kitti, write_tum, write_numpy, write_rows])
 def test_every_format_gives_the_same_poses(tmp_path: Path, write: Callable[[Path], Path]) -> None:
     path = write(tmp_path / "poses.txt")
+    np.testing.assert_allclose(read_poses(path).at(None, len(POSES)), POSES, atol=1e-9)
+
+
+def test_a_calibration_turns_no_other_format(tmp_path: Path) -> None:
+    (tmp_path / "calib.txt").write_text(f"Tr: {' '.join(map(str, TO_CAMERA[:3].ravel()))}\n")
+    path = write_numpy(tmp_path / "poses")
     np.testing.assert_allclose(read_poses(path).at(None, len(POSES)), POSES, atol=1e-9)
 
 
@@ -50,12 +64,12 @@ def test_poses_of_the_camera_become_poses_of_the_lidar(tmp_path: Path) -> None:
     records = dataset.records(["00"])
     poses = dataset.poses(records)
     assert poses is not None
-    np.testing.assert_allclose(poses, POSES, atol=1e-9)
+    np.testing.assert_allclose(poses, drive_poses(), atol=1e-9)
 
     # The number of a scan is the line of its pose.
     some = dataset.poses(records[3:5])
     assert some is not None
-    np.testing.assert_allclose(some, POSES[3:5], atol=1e-9)
+    np.testing.assert_allclose(some, drive_poses()[3:5], atol=1e-9)
 
 
 def test_a_dataset_without_poses_has_none(tmp_path: Path) -> None:
@@ -113,8 +127,8 @@ def test_poses_are_interpolated_at_the_times_of_the_scans(tmp_path: Path) -> Non
     for pose, before in zip(halfway, (0, 3), strict=True):
         middle = (POSES[before, :3, 3] + POSES[before + 1, :3, 3]) / 2
         np.testing.assert_allclose(pose[:3, 3], middle, atol=1e-9)
-        turn = np.arctan2(pose[1, 0], pose[0, 0])
-        assert turn == pytest.approx(0.03 * (before + 0.5))
+        turn = Rotation.from_matrix(POSES[before, :3, :3].T @ pose[:3, :3])
+        np.testing.assert_allclose(turn.as_rotvec(), [0, 0, 0.03 / 2], atol=1e-9)
 
 
 def test_before_the_first_pose_and_after_the_last_the_motion_goes_on(tmp_path: Path) -> None:
@@ -146,6 +160,12 @@ def with_nan(poses: np.ndarray) -> np.ndarray:
     return poses
 
 
+def far(poses: np.ndarray) -> np.ndarray:
+    poses = poses.copy()
+    poses[2, 1, 3] = 1e9
+    return poses
+
+
 def scaled(poses: np.ndarray) -> np.ndarray:
     poses = poses.copy()
     poses[:, :3, :3] *= 1.1
@@ -157,13 +177,30 @@ def mirrored(poses: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "word"), [(with_nan, "no number"), (scaled, "no rotation"), (mirrored, "no rotation")]
+    ("spoil", "word"),
+    [
+        (with_nan, "no number"),
+        (far, "more than 1e+08 m"),
+        (scaled, "no rotation"),
+        (mirrored, "no rotation"),
+    ],
 )
 def test_what_is_no_rigid_motion_is_one_line(
     tmp_path: Path, spoil: Callable[[np.ndarray], np.ndarray], word: str
 ) -> None:
     path = write_kitti(tmp_path / "poses.txt", spoil(POSES))
     fails(lambda: read_poses(path), "poses.txt", word)
+
+
+def test_no_poses_are_one_line(tmp_path: Path) -> None:
+    path = write_numpy(tmp_path / "poses", POSES[:0])
+    fails(lambda: read_poses(path), "poses.npy", "found none")
+
+
+def test_equal_times_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "tum.txt"
+    path.write_text("1 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
+    fails(lambda: read_poses(path), "ascending times")
 
 
 def test_angles_in_place_of_quaternions_are_one_line(tmp_path: Path) -> None:
@@ -192,7 +229,8 @@ def test_pickled_poses_are_refused(tmp_path: Path) -> None:
     fails(lambda: read_poses(path), "poses.npy")
 
 
-def test_a_calibration_without_tr_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("line", ["P0: 1 0 0", "Tr: 1 2", f"Tr: {'0 ' * 12}"])
+def test_a_calibration_without_a_motion_is_one_line(tmp_path: Path, line: str) -> None:
     write_kitti(tmp_path / "poses.txt", TO_CAMERA @ POSES @ np.linalg.inv(TO_CAMERA))
-    (tmp_path / "calib.txt").write_text("P0: 1 0 0\n")
+    (tmp_path / "calib.txt").write_text(f"{line}\n")
     fails(lambda: read_poses(tmp_path / "poses.txt"), "calib.txt", "Tr")

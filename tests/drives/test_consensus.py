@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,6 +76,15 @@ def test_the_consensus_equals_its_formula(scans: int, reach: int, past_only: boo
     assert [item for item, *_ in results] == list(range(scans))
     for (_, fused, _), reference in zip(results, expected(drive, consensus), strict=True):
         np.testing.assert_allclose(fused, reference, atol=1e-5)
+
+
+def test_a_second_drive_and_scores_that_do_not_add_up_to_1_change_nothing() -> None:
+    drive = random_drive(5)
+    consensus = Consensus(reach=2)
+    first = list(consensus.stream(drive))
+    scaled = [replace(scan, scores=scan.scores * (2 + scan.item)) for scan in drive]
+    for (_, fused, _), (_, again, _) in zip(first, consensus.stream(scaled), strict=True):
+        np.testing.assert_allclose(again, fused, atol=1e-5)
 
 
 def test_a_scan_follows_when_the_scans_after_it_are_read() -> None:

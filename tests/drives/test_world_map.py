@@ -18,7 +18,7 @@ from amvnet.errors import InputError
 from amvnet.inference import map as mapping
 from amvnet.weights.file import save
 
-from fixtures.commands import refusal, run_cli, succeed
+from fixtures.commands import fails, refusal, run_cli, succeed
 from fixtures.drives import SCANS, drive_poses, write_drive
 from fixtures.tiny import fresh_weights
 
@@ -74,10 +74,30 @@ def test_voxels_equal_a_loop_over_the_points() -> None:
 
 def test_what_may_move_is_left_out_unless_it_is_wanted() -> None:
     builder = MapBuilder(SIZE, SEMANTICKITTI)
-    xyz = np.array([[1.1, 0.1, 0.1], [5.1, 0.1, 0.1]])
-    builder.add(xyz, scores_of(np.array([ROAD, CAR])), np.eye(4))
-    assert builder.build().labels.tolist() == [ROAD]
-    assert sorted(builder.build(keeps_movable=True).labels.tolist()) == [CAR, ROAD]
+    labels = np.arange(1, SEMANTICKITTI.size + 1)
+    xyz = np.column_stack([labels + 0.1, 0 * labels, 0 * labels])
+    builder.add(xyz, scores_of(labels), np.eye(4))
+    assert builder.build().labels.tolist() == list(range(ROAD, SEMANTICKITTI.size + 1))
+    assert builder.build(keeps_movable=True).labels.tolist() == labels.tolist()
+
+
+def test_a_map_far_from_the_origin_is_continued_as_it_was(tmp_path: Path) -> None:
+    builder = MapBuilder(SIZE, SEMANTICKITTI)
+    pose = np.eye(4)
+    pose[:3, 3] = (400_000.3, 5_000_000.7, 100)
+    builder.add(np.array([[1.1, 0.1, 0.1]]), scores_of(np.array([ROAD])), pose)
+    builder.save(tmp_path / "part.npz", "a request", done=1)
+    other = MapBuilder(SIZE, SEMANTICKITTI)
+    assert other.restore(tmp_path / "part.npz", "a request") == 1
+    np.testing.assert_array_equal(other.build().xyz, builder.build().xyz)
+
+
+def test_the_number_of_sights_ends_at_the_largest_that_a_file_holds() -> None:
+    builder = MapBuilder(SIZE, SEMANTICKITTI)
+    builder.add(np.zeros((1, 3)), scores_of(np.array([ROAD])), np.eye(4))
+    keys, sums, scans = builder._table.contents()
+    builder._table.restore(keys, sums, scans + 70_000)
+    assert builder.build().sights.tolist() == [65_535]
 
 
 def test_a_car_that_drives_away_leaves_the_road() -> None:
@@ -94,6 +114,7 @@ def test_a_map_of_nothing_has_no_voxels(tmp_path: Path) -> None:
     for ending in ("ply", "las", "laz"):
         world.write(tmp_path / f"map.{ending}")
     assert len(PlyData.read(tmp_path / "map.ply")["vertex"]) == 0
+    fails(lambda: world.write(tmp_path / "map.txt"), ".laz")
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +219,7 @@ def test_a_map_that_was_stopped_is_resumed_to_the_same_map(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.ply", "whole.ply"]
 
 
-@pytest.mark.parametrize("content", [b"", b"PK", {"done": 2}, {"request": "other"}])
+@pytest.mark.parametrize("content", [b"", b"PK", b"PK\x03\x04", {"done": 2}, {"request": "other"}])
 def test_an_unfinished_map_that_cannot_be_read_is_begun_anew(
     tmp_path: Path, content: bytes | dict[str, object]
 ) -> None:

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.poses import Poses
+from amvnet.drives.consensus import REACH
 from amvnet.drives.odometry import Odometry, Pair, check_fit
-from amvnet.inference.drive import find_poses
+from amvnet.inference.drive import Drives, find_poses
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.pipeline import Pipeline
 from amvnet.sensors.lidars import AXES
@@ -75,6 +76,64 @@ def test_past_scans_alone_give_other_labels_at_once(world: Path) -> None:
     results = amvnet.drive(segmenter, scans(), POSES, past_only=True)
     for index, _ in enumerate(results):
         assert len(read) == index + 1
+
+
+def test_lost_returns_of_a_drive_get_no_label_and_move_no_pose(world: Path) -> None:
+    segmenter = amvnet.load(world / "w.safetensors")
+    scans = [points for points, _ in drive_scans(3)]
+    for points in scans:
+        points[::9, :3] = np.nan
+        points[1::9, :3] = 0
+    for poses in (POSES[:3], None):
+        if poses is None:
+            pytest.importorskip("kiss_icp")
+        for points, result in zip(scans, amvnet.drive(segmenter, scans, poses), strict=True):
+            valid = np.isfinite(points[:, 0]) & (points[:, 0] != 0)
+            np.testing.assert_array_equal(result.labels > 0, valid)
+
+
+@pytest.mark.parametrize(
+    ("poses", "words"), [(POSES[:2], ["for each scan", "found 2"]), (0 * POSES, ["no rotation"])]
+)
+def test_too_few_or_impossible_poses_are_one_line(
+    world: Path, poses: Poses, words: list[str]
+) -> None:
+    segmenter = amvnet.load(world / "w.safetensors")
+    scans = [points for points, _ in drive_scans(3)]
+    fails(lambda: list(amvnet.drive(segmenter, scans, poses)), "poses", *words)
+
+
+def test_networks_see_the_scans_in_reach_from_angles_of_their_own() -> None:
+    keys = [(source, str(index)) for source in ("a", "b") for index in range(2 * REACH + 1)]
+    yaws = Drives(dict.fromkeys(keys, np.eye(4)), of_files=False).yaws
+    of_one = np.sort(np.mod([yaws["a", str(index)] for index in range(2 * REACH + 1)], 2 * np.pi))
+    assert np.diff(of_one, append=of_one[0] + 2 * np.pi).min() > np.pi / (2 * REACH + 1)
+    for source, name in keys:
+        assert yaws[source, name] == yaws["a", name]
+
+
+@pytest.mark.parametrize("seconds", [100.05, 1_700_000_000.25])
+def test_names_of_scans_in_nanoseconds_are_times(
+    world: Path, tmp_path: Path, seconds: float
+) -> None:
+    """The poses lie between the scans."""
+    track = []
+    for index in range(-1, 12):
+        pose = POSES[max(index, 0)]
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        track.append([seconds + index, *pose[:3, 3], *quaternion])
+    np.savetxt(tmp_path / "tum.txt", track)
+    for factor, digits in ((1, 6), (10**9, 0)):
+        folder = tmp_path / f"{factor}"
+        folder.mkdir()
+        for index, (points, _) in enumerate(drive_scans(5)):
+            stamp = f"{seconds + index:.6f}" if digits else str(round((seconds + index) * 10**9))
+            points.tofile(folder / f"{stamp}.bin")
+        scans, _ = list_inputs([str(folder)])
+        if seconds < 1e6 and not digits:
+            continue  # as seconds since 1970
+        found = find_poses(scans, tmp_path / "tum.txt")
+        np.testing.assert_allclose(list(found.poses.values()), POSES[:5], atol=1e-6)
 
 
 def test_an_interrupted_run_resumes_to_the_same_labels(
@@ -216,16 +275,18 @@ def test_a_drive_needs_scans_of_one_recording_in_a_row(world: Path, tmp_path: Pa
 @pytest.mark.full
 def test_a_broken_scan_is_left_out_of_its_drive(world: Path, tmp_path: Path) -> None:
     write_drive(tmp_path / "data")
-    path = tmp_path / "data/sequences/00/velodyne/000003.bin"
-    path.write_bytes(path.read_bytes()[:-3])
+    broken = ("000003.bin", f"{SCANS - 1:06d}.bin")
+    for name in broken:
+        path = tmp_path / "data/sequences/00/velodyne" / name
+        path.write_bytes(path.read_bytes()[:-3])
     code, error = run_cli(
         *predict(tmp_path, tmp_path / "out")
         .replace(f"{tmp_path}/w.safetensors", f"{world}/w.safetensors")
         .split()
     )
     assert code == 3
-    assert "000003.bin" in error
-    assert len(files(tmp_path / "out")) == SCANS - 1
+    assert all(name in error for name in broken)
+    assert len(files(tmp_path / "out")) == SCANS - len(broken)
 
 
 def test_evaluate_scores_the_labels_that_predict_writes(world: Path, tmp_path: Path) -> None:

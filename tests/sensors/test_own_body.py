@@ -14,17 +14,18 @@ import amvnet
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.formats.cloud import Cloud
 from amvnet.inference.journal import read_journals
+from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.lidars import Sensor, make_sensor
 from amvnet.sensors.normalise import Normaliser
-from amvnet.sensors.own_body import own_points
+from amvnet.sensors.own_body import mark_own, own_points
 from amvnet.weights.file import save
 
 from fixtures.commands import fails, succeed
 from fixtures.sensors import LASERS, is_on_nuscenes_car, on_nuscenes_car, place
 from fixtures.tiny import fresh_weights
 
-BOX = (-1.0, -2.0, -3.0, 4.0, 5.0, 6.0)
+BOX = (-1.0, -2.0, -0.5, 4.0, 5.0, 0.6)
 
 
 def own_of(points: np.ndarray, **sensor: Any) -> np.ndarray:
@@ -59,16 +60,33 @@ def test_near_points_are_of_the_body_only_with_its_lasers_and_if_many(
     assert not own_of(points).any()
 
 
+def test_lost_returns_hide_no_body_and_twice_as_many_rings_show_another_sensor() -> None:
+    points, laser = on_nuscenes_car()
+    expected = own_points(points, laser, Sensor())
+    assert expected is not None
+    lost = np.arange(len(points)) % 50 == 0
+    points[lost, :3] = np.nan
+    for ring in (laser, None):
+        np.testing.assert_array_equal(own_points(points, ring, Sensor()), expected & ~lost)
+    assert own_points(points, 2 * laser + np.arange(len(points)) // 32 % 2, Sensor()) is None
+
+
+def test_the_body_that_a_scan_states_stays() -> None:
+    points, laser = on_nuscenes_car()
+    scan = Scan(points, ring=laser, own=np.zeros(len(points), bool))
+    assert mark_own(scan, Sensor()) is scan
+
+
 def test_a_stated_body_counts_for_any_sensor() -> None:
     points, laser = place(LASERS["vlp16"], 0.9)
     own = own_points(points, laser, Sensor(own_body=BOX))
     assert own is not None
     expected = []
     for x, y, z, _ in points:
-        expected.append(-1 <= x <= 4 and -2 <= y <= 5 and -3 <= z <= 6)
+        expected.append(-1 <= x <= 4 and -2 <= y <= 5 and -0.5 <= z <= 0.6)
     assert own.tolist() == expected
     assert 0 < own.sum() < len(own)
-    assert own_of(points, own_body="-1,-2,-3,4,5,6").tolist() == expected
+    assert own_of(points, own_body="-1,-2,-0.5,4,5,0.6").tolist() == expected
     assert not own_of(points, own_body=BOX, keep_own=True).any()
 
 

@@ -15,7 +15,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.drives.consensus import Consensus, DriveScan
 from amvnet.inference.drive import TURN
 from amvnet.training import adapt as adapting
-from amvnet.training.adapt import LEAST_PROBABILITY, LEAST_SIGHTS, Figures
+from amvnet.training.adapt import FIGURES, LEAST_PROBABILITY, LEAST_SIGHTS, Figures, recipe_for
 from amvnet.weights.file import load, save
 
 from fixtures.commands import refusal, run_cli, succeed
@@ -31,6 +31,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("world")
     write_drive(root / "data", scans=SCANS)
     shutil.rmtree(root / "data/sequences/00/labels")
+    for path in (root / "data/sequences/00/velodyne").iterdir():
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        points[::9, :3] = 0  # lost returns
+        points.tofile(path)
     save(fresh_weights(), root / "w.safetensors")
     with pytest.MonkeyPatch.context() as patch:
         # Tiny networks are never sure; any of their labels may teach.
@@ -68,12 +72,27 @@ def test_points_teach_that_are_sure_and_seen_by_several_scans(world: Path) -> No
         scans.append(DriveScan(index, xyz, result.scores, pose))
 
     counts: Counter[str] = Counter()
+    agreeing = 0
     for index, scores, sights in Consensus().stream(scans):
+        labels = np.where(results[index].labels > 0, scores.argmax(axis=1) + 1, 0)
+        agreeing += np.count_nonzero((labels == results[index].labels) & (labels > 0))
         taught = np.load(world / f"run/{TEACHER}/{index:06d}.npy")
         teaches = (scores.max(axis=1) > 0.07) & (sights >= LEAST_SIGHTS)
         np.testing.assert_array_equal(taught, np.where(teaches, scores.argmax(axis=1) + 1, 0))
         counts.update(map(str, teaches.tolist()))
     assert set(counts) == {"True", "False"}
+    figures = json.loads((world / "run" / TEACHER).parent.joinpath(FIGURES).read_text())
+    valid = sum(np.count_nonzero(result.labels) for result in results)
+    uncertain = sum(np.count_nonzero(result.uncertain) for result in results)
+    assert figures["uncertain"] == pytest.approx(uncertain / valid)
+    assert figures["consistency"] == pytest.approx(agreeing / valid)
+    both = 0
+    for result in results:
+        assert result.rv is not None
+        assert result.bev is not None
+        is_same = result.rv.argmax(axis=1) == result.bev.argmax(axis=1)
+        both += np.count_nonzero(is_same & (result.labels > 0))
+    assert figures["agreement"] == pytest.approx(both / valid)
     assert LEAST_PROBABILITY == 0.6
 
 
@@ -148,6 +167,14 @@ def test_the_figures_of_labels_tell_which_are_surer() -> None:
     assert Figures(0.1, 0.9, 0.8).is_better_than(before)
     assert not Figures(0.1, 0.7, 0.9).is_better_than(before)
     assert not Figures(0.3, 0.9, 0.9).is_better_than(before)
+    assert not Figures(0.2, 0.9, 0.9).is_better_than(before)
+    assert not Figures(0.1, 0.8, 0.9).is_better_than(before)
+
+
+def test_the_recipe_has_the_values_of_the_options(world: Path) -> None:
+    training = recipe_for(load(world / "w.safetensors"), epochs=3, streets=0.0, seed=7).training
+    assert (training.rv.epochs, training.bev.epochs) == (3, 3)
+    assert (training.others, training.seed) == (0.0, 7)
 
 
 def test_adapted_weights_expect_the_scans_of_the_weights_that_taught(world: Path) -> None:

@@ -139,6 +139,7 @@ def by_laser(points: np.ndarray, laser: np.ndarray) -> np.ndarray:
 
 
 HDL64E = np.linspace(-23.9, 3, 64)
+HALF_A_STEP = rotation_from_degrees(0.5, 0, 0).T  # after it, no point lies straight ahead
 
 
 def kitti_like(folder: Path) -> Case:
@@ -214,10 +215,10 @@ def with_permuted_rings(folder: Path) -> Case:
 
 
 def with_a_laser_that_sees_only_the_car(
-    near: int, order: Callable[[np.ndarray], np.ndarray], folder: Path
+    near: int, radius: float, order: Callable[[np.ndarray], np.ndarray], folder: Path
 ) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
-    points[laser == near, :2] *= 0.9 / np.hypot(*points[laser == near, :2].T)[:, None]
+    points[laser == near, :2] *= radius / np.hypot(*points[laser == near, :2].T)[:, None]
     path = write_bin(folder / "near.pcd.bin", with_ring(points, order(laser)))
     return Case(path, "sim-hdl32e", rows="laser")
 
@@ -237,8 +238,9 @@ def of_half_the_lasers(folder: Path) -> Case:
 
 def on_a_tilted_sensor(folder: Path) -> Case:
     """The lasers keep to their elevations in the file, and not when the ground is level."""
-    points, laser = place(HDL64E, 1.73, slope=8)
+    points, laser = place(HDL64E, 1.73, slope=4)
     points = by_laser(points, laser)
+    points[:, :3] = points[:, :3] @ HALF_A_STEP
     return Case(write_bin(folder / "slope.bin", points), rows="laser")
 
 
@@ -271,7 +273,8 @@ def changed(change: Callable[[np.ndarray], np.ndarray], folder: Path) -> Case:
 
 
 def tilt(points: np.ndarray) -> np.ndarray:
-    return np.column_stack([points[:, :3] @ rotation_from_degrees(0, 14, 0), points[:, 3]])
+    turned = points[:, :3] @ HALF_A_STEP @ rotation_from_degrees(0, 14, 0)
+    return np.column_stack([turned, points[:, 3]])
 
 
 def gather(points: np.ndarray) -> np.ndarray:
@@ -426,8 +429,9 @@ RING_ORDERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "reversed": lambda laser: 31 - laser,
     "permuted": lambda laser: np.random.default_rng(0).permutation(32)[laser],
 }
-for near, (name, order) in product((0, 9), RING_ORDERS.items()):
-    MAKERS[f"near_{near}_{name}"] = partial(with_a_laser_that_sees_only_the_car, near, order)
+for near, radius, (name, order) in product((0, 9), (0.9, 0.0), RING_ORDERS.items()):
+    make_near = partial(with_a_laser_that_sees_only_the_car, near, radius, order)
+    MAKERS[f"near_{near}_{radius}_{name}"] = make_near
 for make, is_optional in product((kitti_like, without_intensity, bright), (False, True)):
     name = f"other_{make.__name__}_{is_optional}"
     MAKERS[name] = partial(for_weights_that_match_nothing, make, is_optional)

@@ -142,7 +142,7 @@ class MapBuilder:
             InputError: if the file is of another map.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 state = dict(file)
             earlier, done = str(state.pop("request")), int(state.pop("done"))
             origin = state.pop("origin")
