@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -117,11 +117,16 @@ class OnnxSegmenter:
                 or out of range.
         """
         if isinstance(points, Scan):
-            scan = points
+            scan = replace(points, points=np.asarray(points.points, np.float32))
         else:
             ring = None if ring is None else np.asarray(ring)
+            table = as_array(points, "points of shape (N, 4)")
+            if table.dtype.names is not None:
+                raise InputError(
+                    "expected points of shape (N, 4), found named columns; stack x, y, z, intensity"
+                )
             with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: not valid
-                table = as_array(points, "points of shape (N, 4)").astype(np.float32)
+                table = table.astype(np.float32)
             scan = Scan(table, ring=ring)
             with errors_of("scan"):
                 check_metres(Cloud(table[:, :3]))

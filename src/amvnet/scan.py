@@ -189,18 +189,17 @@ def as_array(values: AnyArray, expected: str) -> np.ndarray:
         InputError: if the values are not numbers, or the lists differ in length.
     """
     numbers: Any = values
-    if hasattr(values, "detach"):
-        numbers = values.detach().cpu()
-        if numbers.element_size() < 4:
-            numbers = numbers.float()  # NumPy has no bfloat16
-    elif hasattr(values, "to_records"):
-        numbers = values.to_records(index=False)
-    elif isinstance(values, np.ma.MaskedArray) and values.dtype.names is None:
-        numbers = np.ma.filled(values.astype(np.float64), np.nan)
-
     try:
+        if hasattr(values, "detach"):
+            numbers = values.detach().cpu()
+            if numbers.element_size() < 4:
+                numbers = numbers.float()  # NumPy has no bfloat16
+        elif hasattr(values, "to_records"):
+            numbers = values.to_records(index=False)
+        elif isinstance(values, np.ma.MaskedArray) and values.dtype.names is None:
+            numbers = np.ma.filled(values.astype(np.float64), np.nan)
         array = np.asarray(numbers)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # torch raises the last one
         raise InputError(
             f"expected {expected}, found a {type(values).__name__} "
             f"({reason_of(error)[:60]}); give one array"

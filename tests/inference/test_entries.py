@@ -327,6 +327,16 @@ def test_every_entry_gives_a_scan_the_same_labels(saved: World, name: str) -> No
         assert (labels == expected).mean() > 0.995, entry.__name__
 
 
+@pytest.mark.full
+def test_a_million_points_get_the_labels_of_every_entry(saved: World) -> None:
+    points = np.resize(plain(), (1_000_001, 4))
+    points[:, :3] += np.random.default_rng(0).normal(0, 0.02, (len(points), 3))
+    expected = saved.segmenter(points).labels
+    assert expected.all()
+    for entry in (by_predict, by_view):
+        assert (entry(saved, points) == expected).mean() > 0.995, entry.__name__
+
+
 def is_lost(points: np.ndarray) -> np.ndarray:
     """Return which points of a scan are lost returns."""
     xyz = points[:, :3].astype(np.float32)
@@ -597,14 +607,17 @@ def by_runner(world: World, points: np.ndarray) -> None:
 
 
 def labels_of_runner(world: World, points: np.ndarray) -> np.ndarray:
+    scan = scan_of(points)
+    return blind_runner(world)(scan.points, scan.ring).labels
+
+
+def blind_runner(world: World) -> BlindRunner:
     graphs = {"range_net": {"file": "range_net.onnx", "inputs": []}}
     description = describe_export(BY_LASER, "rv", graphs)
     (world.folder / onnx_runner.DESCRIPTION).write_text(json.dumps(description))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(onnx_runner, "_open_graph", lambda *_: None)
-        runner = BlindRunner(world.folder, keep_own=world.keep_own)
-    scan = scan_of(points)
-    return runner(scan.points, scan.ring).labels
+        return BlindRunner(world.folder, keep_own=world.keep_own)
 
 
 AS_GIVEN = (*IN_MEMORY, *OF_DATASETS, by_runner, by_fuse, by_training, by_calibration)
@@ -754,6 +767,55 @@ def test_a_scan_that_is_moved_and_moved_back_keeps_the_rows_of_its_lasers(
         assert row is not None
         np.testing.assert_array_equal(result.origin.scan.row, row)
         assert (result.labels == expected.labels).mean() > 0.995
+
+
+def with_fields(points: np.ndarray) -> np.ndarray:
+    """Return an array with fields in the other byte order, as of PCL on a network."""
+    kind = np.dtype([(name, ">f4") for name in ("x", "y", "z", "intensity")])
+    return points.astype(">f4").view(kind)[:, 0]
+
+
+ARRAYS: dict[str, Callable[[np.ndarray], Any]] = {
+    "half precision": lambda points: points.astype(np.float16),
+    "by columns": np.asfortranarray,
+    "backwards": lambda points: points[::-1][::-1],
+    "read-only": lambda points: np.lib.stride_tricks.as_strided(points, writeable=False),
+    "another byte order": lambda points: points.astype(">f8"),
+    "named": with_fields,
+    "with a gradient": lambda points: torch.from_numpy(points).requires_grad_(),
+    "on no device": lambda points: torch.from_numpy(points).to("meta"),
+    "sparse": lambda points: torch.from_numpy(points).to_sparse(),
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_every_kind_of_array_is_labelled_or_one_line(by_laser: World, name: str) -> None:
+    points = in_order()
+    if name == "half precision":
+        points = points.astype(np.float16).astype(np.float32)
+    expected = by_laser.segmenter(points).labels
+    given = ARRAYS[name](points)
+    if name in ("on no device", "sparse"):
+        fails(partial(by_laser.segmenter, given), "a Tensor", "give one array")
+        fails(partial(blind_runner(by_laser), given), "a Tensor", "give one array")
+        return
+    np.testing.assert_array_equal(by_laser.segmenter(given).labels, expected)
+    labels = blind_runner(by_laser)(points).labels
+    if name == "named":
+        fails(partial(blind_runner(by_laser), given), "named columns", "stack")
+        return
+    np.testing.assert_array_equal(blind_runner(by_laser)(given).labels, labels)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float64, ">f4", np.int64])
+def test_the_runner_gives_its_graphs_float32(by_laser: World, kind: Any) -> None:
+    points = in_order().astype(kind)
+    with watched() as seen:
+        for given in (points, Scan(points)):
+            blind_runner(by_laser)(given)
+    for read, _ in seen:
+        assert read.dtype == np.float32
+        np.testing.assert_array_equal(read, seen[0][0])
 
 
 OF_LOST_RETURNS = ("-1 in 300 of 1,500 points", "write 0")

@@ -25,7 +25,7 @@ from fixtures.commands import fails, succeed
 from fixtures.sensors import LASERS, is_on_nuscenes_car, on_nuscenes_car, place
 from fixtures.tiny import fresh_weights
 
-BOX = (-1.0, -2.0, -0.5, 4.0, 5.0, 0.6)
+BOX = (-1.0, -2.0, -0.5, 14.0, 5.0, 0.6)
 
 
 def own_of(points: np.ndarray, **sensor: Any) -> np.ndarray:
@@ -71,6 +71,14 @@ def test_lost_returns_hide_no_body_and_twice_as_many_rings_show_another_sensor()
     assert own_points(points, 2 * laser + np.arange(len(points)) // 32 % 2, Sensor()) is None
 
 
+def test_near_points_alone_show_no_body() -> None:
+    """They may be a box that a robot looks at."""
+    points, laser = on_nuscenes_car()
+    near = np.hypot(points[:, 0], points[:, 1]) < 1
+    assert near.sum() > 100
+    assert own_points(points[near], laser[near], Sensor()) is None
+
+
 def test_the_body_that_a_scan_states_stays() -> None:
     points, laser = on_nuscenes_car()
     scan = Scan(points, ring=laser, own=np.zeros(len(points), bool))
@@ -83,10 +91,10 @@ def test_a_stated_body_counts_for_any_sensor() -> None:
     assert own is not None
     expected = []
     for x, y, z, _ in points:
-        expected.append(-1 <= x <= 4 and -2 <= y <= 5 and -0.5 <= z <= 0.6)
+        expected.append(-1 <= x <= 14 and -2 <= y <= 5 and -0.5 <= z <= 0.6)
     assert own.tolist() == expected
     assert 0 < own.sum() < len(own)
-    assert own_of(points, own_body="-1,-2,-0.5,4,5,0.6").tolist() == expected
+    assert own_of(points, own_body="-1,-2,-0.5,14,5,0.6").tolist() == expected
     assert not own_of(points, own_body=BOX, keep_own=True).any()
 
 

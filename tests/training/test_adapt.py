@@ -75,7 +75,7 @@ def test_points_teach_that_are_sure_and_seen_by_several_scans(world: Path) -> No
     agreeing = 0
     for index, scores, sights in Consensus().stream(scans):
         labels = np.where(results[index].labels > 0, scores.argmax(axis=1) + 1, 0)
-        agreeing += np.count_nonzero((labels == results[index].labels) & (labels > 0))
+        agreeing += int(np.count_nonzero((labels == results[index].labels) & (labels > 0)))
         taught = np.load(world / f"run/{TEACHER}/{index:06d}.npy")
         teaches = (scores.max(axis=1) > 0.07) & (sights >= LEAST_SIGHTS)
         np.testing.assert_array_equal(taught, np.where(teaches, scores.argmax(axis=1) + 1, 0))
@@ -91,7 +91,7 @@ def test_points_teach_that_are_sure_and_seen_by_several_scans(world: Path) -> No
         assert result.rv is not None
         assert result.bev is not None
         is_same = result.rv.argmax(axis=1) == result.bev.argmax(axis=1)
-        both += np.count_nonzero(is_same & (result.labels > 0))
+        both += int(np.count_nonzero(is_same & (result.labels > 0)))
     assert figures["agreement"] == pytest.approx(both / valid)
     assert LEAST_PROBABILITY == 0.6
 

@@ -171,6 +171,12 @@ def on_the_car_of_nuscenes(folder: Path) -> Case:
     return Case(path, "sim-hdl32e", rows="ring")
 
 
+def near_points_alone(folder: Path) -> Case:
+    points, laser = on_nuscenes_car()
+    near = np.hypot(points[:, 0], points[:, 1]) < 1
+    return Case(write_bin(folder / "near.bin", with_ring(points, laser)[near]), "sim-hdl32e")
+
+
 def near_points_of_another_sensor(folder: Path) -> Case:
     points, laser = on_nuscenes_car(sensor="os1-64")
     return Case(write_bin(folder / "near.bin", with_ring(points, laser)), rows="laser")
@@ -396,6 +402,7 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     by_elevation,
     nuscenes_like,
     on_the_car_of_nuscenes,
+    near_points_alone,
     near_points_of_another_sensor,
     with_lasers_in_a_column,
     higher_with_lost_returns,

@@ -71,7 +71,7 @@ function withoutOwn(points, rows, places, { xyz, lasers, unit }) {
   });
   const kept = Uint32Array.from(places.keys()).filter((i) => !isOwn(places[i]));
   const share = (places.length - kept.length) / (xyz.length / 3);
-  if (share < LEAST_OWN || !isLikeOf(lasers, BODY.sensor)) return { points, rows, places };
+  if (share < LEAST_OWN || lasers.fov_up === null || !isLikeOf(lasers, BODY.sensor)) return { points, rows, places };
   const result = new Float32Array(4 * kept.length);
   kept.forEach((i, row) => result.set(points.subarray(4 * i, 4 * i + 4), 4 * row));
   return { points: result, rows: rows && Int32Array.from(kept, (i) => rows[i]), places: kept.map((i) => places[i]) };

@@ -38,7 +38,9 @@ def own_points(xyz: np.ndarray, ring: np.ndarray | None, sensor: Sensor) -> np.n
             placed = np.isfinite(part).all(axis=1)
             of_part = None if ring is None else ring[::QUICK_STEP][placed]
             seen = measure_lasers(part[placed], of_part)
-            if seen.is_like(SensorGeometry().override(KNOWN_SENSORS[name])):
+            lasers = SensorGeometry().override(KNOWN_SENSORS[name])
+            # Without distant points, no laser shows the sensor.
+            if seen.fov_up is not None and seen.is_like(lasers):
                 return own
     return None
 
