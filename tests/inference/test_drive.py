@@ -105,7 +105,7 @@ def test_too_few_or_impossible_poses_are_one_line(
 
 def test_networks_see_the_scans_in_reach_from_angles_of_their_own() -> None:
     keys = [(source, str(index)) for source in ("a", "b") for index in range(2 * REACH + 1)]
-    yaws = Drives(dict.fromkeys(keys, np.eye(4)), of_files=False).yaws
+    yaws = Drives(dict.fromkeys(keys, np.eye(4))).yaws
     of_one = np.sort(np.mod([yaws["a", str(index)] for index in range(2 * REACH + 1)], 2 * np.pi))
     assert np.diff(of_one, append=of_one[0] + 2 * np.pi).min() > np.pi / (2 * REACH + 1)
     for source, name in keys:

@@ -309,6 +309,17 @@ CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+def with_random_rings_of_a_few_points(folder: Path) -> Case:
+    case = with_random_rings(folder)
+    table = np.fromfile(case.file, np.float32).reshape(-1, 5)
+    return dataclasses.replace(case, file=write_bin(case.file, table[::100]))
+
+
+def with_rings_on_a_tilted_sensor(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700, slope=15)
+    return Case(write_bin(folder / "steep.pcd.bin", with_ring(points, 31 - laser)), "sim-hdl32e")
+
+
 def without_rings(folder: Path) -> Case:
     points, _ = place(LASERS["hdl32e"], 1.84, steps=700)
     return Case(write_bin(folder / "lone32.bin", points), "sim-hdl32e", rows="ring")
@@ -415,6 +426,8 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     of_half_the_lasers,
     on_a_tilted_sensor,
     with_random_rings,
+    with_random_rings_of_a_few_points,
+    with_rings_on_a_tilted_sensor,
     without_rings,
     tilted,
     with_y_up_in_millimetres,
