@@ -239,13 +239,18 @@ class Consensus:
         fused = torch.from_numpy(means).mul_((1 - OWN) / 2)
         fused = fused.index_select(0, torch.from_numpy(seen.inverse[0]))
         logs = torch.from_numpy(seen.logs)
-        if seen.is_fused.all():
-            return fused.add_(logs, alpha=OWN).div_(STEPS).softmax(dim=1).numpy(), sights
-
         is_fused = torch.from_numpy(seen.is_fused)
-        fused.add_(logs[is_fused], alpha=OWN)
+        is_whole = bool(is_fused.all())
+        fused.add_(logs if is_whole else logs[is_fused], alpha=OWN)
+        # In place: new memory for a softmax takes longer than its numbers. From log LEAST to 0, no
+        # exponential is too large or too small.
+        fused.div_(STEPS).exp_()
+        fused.div_(fused.sum(dim=1, keepdim=True))
+        if is_whole:
+            return fused.numpy(), sights
+
         probabilities = torch.zeros_like(logs)
-        probabilities[is_fused] = fused.div_(STEPS).softmax(dim=1)
+        probabilities[is_fused] = fused
         return probabilities.numpy(), sights
 
 
