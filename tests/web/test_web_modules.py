@@ -646,7 +646,7 @@ def test_the_numbers_of_the_modules_are_those_of_the_package() -> None:
     assert found == NUMBERS
 
 
-READ = [name for name in WRITERS if name.endswith((".bin", ".pcd", ".ply"))]
+READ = [name for name in WRITERS if name.endswith((".bin", ".pcd", ".ply", ".npy"))]
 
 
 @pytest.mark.parametrize("name", with_quick(READ, ["compressed.pcd", "little.ply"]))
@@ -676,6 +676,59 @@ def test_integers_of_any_size_are_read(tmp_path: Path) -> None:
     assert page["text"] == NO_OTHERS.sub("", line)
     assert "32 lasers" in line
     assert np.array_equal(page["rows"], rows_of(case, scan))
+
+
+def test_arrays_of_any_type_and_order_are_read(tmp_path: Path) -> None:
+    points, laser = place(LASERS["os1-64"], 1.73)
+    points[7] = 0
+    with_rings = np.column_stack((points * [1, 1, 1, 255], laser))
+    arrays = {
+        "three": points[:, :3],
+        "double": points.astype(np.float64),
+        "fortran": np.asfortranarray(points),
+        "big": points.astype(">f4"),
+        "millimetres": np.round(points * [1000, 1000, 1000, 255]).astype(np.int32),
+        "rings": with_rings.astype(np.float32),
+        "fortran_rings": np.asfortranarray(with_rings),
+    }
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    cases = [Case(tmp_path / f"{name}.npy") for name in arrays]
+    for case, page in zip(cases, run_page(cases, tmp_path), strict=True):
+        scan, line = normalised(case)
+        assert page["text"] == NO_OTHERS.sub("", line)
+        compared = 3 if case.file.name == "three.npy" else 4  # missing intensities are drawn
+        found = page["points"].reshape(-1, 4)[:, :compared]
+        prepared = case.expected.prepare(scan).points[scan.valid, :compared]
+        np.testing.assert_allclose(found, prepared, atol=1e-5)
+        assert np.array_equal(page["rows"], rows_of(case, scan)), case.file.name
+
+
+def test_other_arrays_are_refused_in_one_line(tmp_path: Path) -> None:
+    points = some_points(3000)
+    labels = np.arange(3000) % 7 * 1000
+    arrays = {
+        "transposed": points.T,
+        "image": points.reshape(50, 60, 4),
+        "fields": points.view([(name, "f4") for name in "xyzi"]),
+        "text": np.array(["a", "b"]),
+        "labels": np.column_stack((points, labels)),
+        "half": points.astype(np.float16),
+    }
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    pickled = np.array([{}, None], object)
+    np.save(tmp_path / "pickled.npy", pickled, allow_pickle=True)
+    whole = (tmp_path / "labels.npy").read_bytes()
+    (tmp_path / "cut.npy").write_bytes(whole[:-5])
+    (tmp_path / "header.npy").write_bytes(whole[:60])
+    (tmp_path / "magic.npy").write_bytes(whole[:8])
+    (tmp_path / "code.npy").write_bytes(whole.replace(b"'<f8'", b"exit()"))
+    paths = sorted(tmp_path.glob("*.npy"))
+    assert len(paths) == 11
+    for path, page in zip(paths, run_page([Case(path) for path in paths], tmp_path), strict=True):
+        assert page["error"].startswith(f"{path.name}: expected "), page
+        assert "\n" not in page["error"]
 
 
 def broken_files(folder: Path) -> list[Path]:
@@ -756,11 +809,11 @@ def problem_of(line: str) -> str:
 
 
 def test_unknown_formats_name_those_that_the_page_reads(tmp_path: Path) -> None:
-    names = [name for name in WRITERS if name.endswith((".npy", ".npz", ".las", ".bag", ".mcap"))]
+    names = [name for name in WRITERS if name.endswith((".npz", ".las", ".bag", ".mcap"))]
     for name in names:
         WRITERS[name](tmp_path / name, some_points())
     results = run_page([Case(tmp_path / name) for name in names], tmp_path)
     for name, page in zip(names, results, strict=True):
         assert page["error"].startswith(
-            f"{name}: expected a scan file (.pcd.bin, .bin, .pcd, .ply)"
+            f"{name}: expected a scan file (.pcd.bin, .bin, .pcd, .ply, .npy)"
         )

@@ -3,7 +3,7 @@
 import { InputError } from "../errors.js";
 import { checkPointCount, makeCloud, ringIndices } from "./cloud.js";
 
-const COLUMNS = ["x", "y", "z", "intensity", "ring"];
+export const COLUMNS = ["x", "y", "z", "intensity", "ring"];
 const KITTI = 4, NUSCENES = 5;  // the number of columns of each layout
 const NAMED_NUSCENES = ".pcd.bin";
 const FEWEST_BYTES = 4800;  // the least size of a file whose values can show that no layout fits, bytes
@@ -63,7 +63,7 @@ function isNuscenes([x, y, z, intensity, values], isNamed) {
 }
 
 /** Return whether whole numbers are the rings of the points instead of their labels. */
-function areRings(x, y, z, ring) {
+export function areRings(x, y, z, ring) {
   const [counts, sums, squares] = [0, 1, 2].map(() => new Float64Array(256));
   ring.forEach((laser, i) => {
     const elevation = Number.isFinite(x[i] + y[i] + z[i]) ? Math.atan2(z[i], Math.hypot(x[i], y[i])) : 0;

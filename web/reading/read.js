@@ -1,6 +1,7 @@
 // Read a scan file; its first bytes or, failing that, its name tell the format.
 
 import { InputError } from "../errors.js";
+import { readNpy } from "./npy.js";
 import { readPcd } from "./pcd.js";
 import { readPly } from "./ply.js";
 import { readRaw } from "./raw.js";
@@ -9,10 +10,11 @@ const KINDS = {
   ".bin": { read: readRaw, expected: "rows of float32" },
   ".pcd": { read: readPcd, expected: "a PCD file" },
   ".ply": { read: readPly, expected: "a PLY file" },
+  ".npy": { read: readNpy, expected: "an array of NumPy" },
 };
 // The format of a file by its first bytes: the formats that are read, and others.
-const BEGINNINGS = { "VERSION": ".pcd", "FIELDS": ".pcd", "ply\n": ".ply", "ply\r": ".ply" };
-const OTHERS = { "\x93NUMPY": ".npy", "PK\x03\x04": ".npz", "LASF": ".las", "#ROSBAG": ".bag", "\x89MCAP0": ".mcap" };
+const BEGINNINGS = { "VERSION": ".pcd", "FIELDS": ".pcd", "ply\n": ".ply", "ply\r": ".ply", "\x93NUMPY": ".npy" };
+const OTHERS = { "PK\x03\x04": ".npz", "LASF": ".las", "#ROSBAG": ".bag", "\x89MCAP0": ".mcap" };
 const COMMENTS = /^(?:#[^\n]*\n|\s*\n)+/;  // the lines that may precede the header of a PCD file
 
 /** Return the cloud of a scan file, given its bytes and its name. */
