@@ -498,6 +498,17 @@ def test_the_browser_hides_classes(path: Path, browser: Browser) -> None:
 
 
 @pytest.mark.full
+@pytest.mark.parametrize(("intensity", "color"), [(0.5, "intensity"), (0.0, "height")])
+def test_a_scan_without_intensity_is_not_coloured_by_it(
+    intensity: float, color: str, tmp_path: Path, browser: Browser
+) -> None:
+    points = np.array([[1, 2, 3, intensity], [4, 5, 6, intensity]])
+    path = tmp_path / "p.html"
+    write_and_read(path, make_scan(points))
+    assert browser.state(path, "color=intensity")["data-color"] == color
+
+
+@pytest.mark.full
 def test_the_browser_draws_only_wrong_points(path: Path, browser: Browser) -> None:
     _, planes = read_page(path).scan(0)
     wrong = (planes["truth"] > 0) & (planes["bev"] != planes["truth"])

@@ -16,7 +16,7 @@ const possible = {
     error: has("truth") && predictions.length > 0,
     uncertainty: has("disagreement"),
     height: true,
-    intensity: true,
+    intensity: about.ranges.intensity[1] > 0,  // a scan without intensities has zeros
   })[mode]),
   only: ONLY.filter((only) => ({
     all: true,
