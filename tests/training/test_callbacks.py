@@ -134,11 +134,11 @@ def test_the_time_of_a_training_is_that_of_all_its_calls(monkeypatch: pytest.Mon
     calls = []
     for _ in range(2):
         call = object.__new__(KeepWeights)
-        call.highest, call.started, call.seconds_before = 0.5, time.monotonic(), 0.0
+        call.highest, call.started, call.seconds_before = 0.5, 1000.0, 0.0
         calls.append(call)
-    monkeypatch.setattr(time, "monotonic", lambda: calls[0].started + 100)
+    monkeypatch.setattr(time, "monotonic", lambda: 1100.0)
     calls[1].load_state_dict(calls[0].state_dict())
-    calls[1].started = calls[0].started + 70
+    calls[1].started = 1070.0
     assert calls[1].state_dict() == {"highest": 0.5, "seconds": 130}
 
 
