@@ -171,6 +171,12 @@ def on_the_car_of_nuscenes(folder: Path) -> Case:
     return Case(path, "sim-hdl32e", rows="ring")
 
 
+def on_the_car_of_nuscenes_in_millimetres(folder: Path) -> Case:
+    points, laser = on_nuscenes_car()
+    np.save(folder / "own_car.npy", with_ring(points, laser) * [1000.0, 1000, 1000, 1, 1])
+    return Case(folder / "own_car.npy", "sim-hdl32e", rows="ring")
+
+
 def near_points_alone(folder: Path) -> Case:
     points, laser = on_nuscenes_car()
     near = np.hypot(points[:, 0], points[:, 1]) < 1
@@ -413,6 +419,7 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     by_elevation,
     nuscenes_like,
     on_the_car_of_nuscenes,
+    on_the_car_of_nuscenes_in_millimetres,
     near_points_alone,
     near_points_of_another_sensor,
     with_lasers_in_a_column,
