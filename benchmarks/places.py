@@ -1,13 +1,12 @@
 """Score weights place by place, because a good score of one place may hide others.
 
-    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--every N] [--calibrated B]
+    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--every N]
 
 DATA is a dataset such as semantickitti:PATH. Each of its sequences is a place. The table shows the
 mIoU over all classes and the accuracy of each method, and the share of uncertain points, for each
 place and for all places together.
 With --no-intensity, the intensities of all scans are set to 0. With --every N, only every Nth scan
-is scored. For weights of `amvnet.weights.calibrate --bev B`, --calibrated B also scores the plain
-ensemble, in which both networks have the same weight as in the paper.
+is scored.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ def score(
     records: Sequence[ScanRecord],
     segmenter: Segmenter,
     intensity: bool,
-    calibrated: float | None,
 ) -> Evaluation:
     """Score the methods of the paper on some scans."""
     evaluation = Evaluation(dataset.taxonomy)
@@ -44,20 +42,17 @@ def score(
         assert result.rv is not None
         assert result.bev is not None
 
-        scores = {"rv": result.rv, "bev": result.bev}
-        if calibrated is not None:
-            scores["plain"] = plain(result.rv, result.bev, calibrated)
-        scores |= {"ensemble": result.rv * result.bev, "amvnet": result.scores}
+        scores = {
+            "rv": result.rv,
+            "bev": result.bev,
+            "ensemble": result.rv * result.bev,
+            "amvnet": result.scores,
+        }
         ids = {}
         for name, values in scores.items():
             ids[name] = np.where(result.labels > 0, values.argmax(axis=1) + 1, 0)
         evaluation.add(scan.points, scan.labels, ids, result.uncertain)
     return evaluation
-
-
-def plain(f: np.ndarray, g: np.ndarray, bev: float) -> np.ndarray:
-    """Return the scores (N, K) that the ensemble would have without calibration."""
-    return f ** (1 / (2 - 2 * bev)) * g ** (1 / (2 * bev))
 
 
 def without_intensity(scan: Scan) -> Scan:
@@ -85,26 +80,18 @@ def main() -> None:
     parser.add_argument("weights")
     parser.add_argument("--no-intensity", action="store_true")
     parser.add_argument("--every", type=int, default=1)
-    parser.add_argument("--calibrated", type=float, metavar="B")
     options = parser.parse_args()
 
     dataset = open_dataset(options.data)
     segmenter = amvnet.load(options.weights)
-    methods = ["rv", "bev", *(["plain"] if options.calibrated else []), "ensemble", "amvnet"]
     chosen = dataset.records(dataset.sequences("all"))[:: options.every]
-    table = Table("place", *methods, "uncertain, %")
+    table = Table("place", "rv", "bev", "ensemble", "amvnet", "uncertain, %")
     total = Evaluation(dataset.taxonomy)
     for place in dataset.sequences("all"):
         records = [record for record in chosen if record.sequence == place]
         if not records:
             continue
-        evaluation = score(
-            dataset,
-            records,
-            segmenter,
-            intensity=not options.no_intensity,
-            calibrated=options.calibrated,
-        )
+        evaluation = score(dataset, records, segmenter, intensity=not options.no_intensity)
         add_row(table, place, evaluation, dataset.taxonomy.size)
         total += evaluation
     add_row(table, "all", total, dataset.taxonomy.size)

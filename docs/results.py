@@ -18,7 +18,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs/results.json"
 PAGES = ("README.md", "docs/index.md", "docs/log.md", "docs/evaluation.md", "docs/finetuning.md")
-PRINTED_METHODS = ("rv", "bev", "plain", "ensemble", "amvnet", "drive")
+PRINTED_METHODS = ("rv", "bev", "ensemble", "amvnet", "drive")
 # The seven classes of the map `lidog`, in its order.
 SEVEN = ("vehicle", "person", "road", "sidewalk", "terrain", "man-made", "vegetation")
 TRUSTED = 60.0  # the least IoU of a class that can be trusted, percent
@@ -105,7 +105,7 @@ def finetuning() -> str:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as a table in Markdown; the best method of each row is in bold."""
-    methods = ("RV", "BEV", "Plain ensemble", "Ensemble", "AMVNet", "Drive")
+    methods = ("RV", "BEV", "Ensemble", "AMVNet", "Drive")
     lines = []
     for row in rows:
         best = max(row[method] for method in PRINTED_METHODS if method in row)

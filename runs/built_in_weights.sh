@@ -17,14 +17,8 @@ if [[ $# -gt 0 && $1 != --* ]]; then
 fi
 
 case $sensor in
-    hdl64e)
-        recipe=simulated-compact
-        calibration=()
-        ;;
-    hdl32e)
-        recipe=simulated-hdl32e-compact
-        calibration=(--prior 0 --bev 0.65)
-        ;;
+    hdl64e) recipe=simulated-compact ;;
+    hdl32e) recipe=simulated-hdl32e-compact ;;
     *) echo "expected hdl64e or hdl32e, found $sensor" >&2 && exit 2 ;;
 esac
 train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --resume)
@@ -48,14 +42,9 @@ done
 wait %1
 wait %2
 
-# Calibrate both networks: class weights make them name rare classes too often on real streets, and RV is
-# too sure of itself.
-calibrated=$out/calibrated.safetensors
-python -m amvnet.weights.calibrate "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$calibrated" "${calibration[@]}"
-
 # Train the head on streets that the networks have not seen, with stronger changes of the sensor and with
 # disturbed scores. On streets like their own, the networks are too sure, and the head would rely on them.
-"${train[@]}" --out "$out/head" --init "$calibrated" --stage head \
+"${train[@]}" --out "$out/head" --init "$out/run/weights.safetensors" --stage head \
     --train-sequences "$(seq -s, 800000 800154)" --training.head.views 1 --training.head.points 600000 \
     --training.head.epochs 10 --training.head.disturb 0.3 \
     --training.augment.tilt 4 --training.augment.height 0.4 --training.augment.drop 0.5 \

@@ -341,11 +341,12 @@ def test_for_extreme_logits_the_gradient_of_the_loss_is_finite(region_loss: Regi
     assert logits.grad.isfinite().all()
 
 
-def test_class_weights_are_proportional_to_the_square_root_of_the_inverse_frequency() -> None:
-    weights = class_weights(np.array([100, 400, 2500]))
+@pytest.mark.parametrize("power", [0.5, 0.4])
+def test_class_weights_are_powers_of_the_inverse_frequency(power: float) -> None:
+    weights = class_weights(np.array([100, 400, 2500]), power)
     assert weights.dtype == np.float32
-    assert weights[0] / weights[1] == pytest.approx(math.sqrt(400 / 100))
-    assert weights[1] / weights[2] == pytest.approx(math.sqrt(2500 / 400))
+    assert weights[0] / weights[1] == pytest.approx((400 / 100) ** power)
+    assert weights[1] / weights[2] == pytest.approx((2500 / 400) ** power)
     assert weights.mean() == pytest.approx(1)
 
 

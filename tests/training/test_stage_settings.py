@@ -42,10 +42,10 @@ def arguments(world: Path, out: Path, stage: str, *options: object) -> list[obje
     return ["train", world / "recipe.yaml", *shared, *options]
 
 
-@pytest.mark.parametrize("weighted", [pytest.param(False, marks=pytest.mark.full), True])
+@pytest.mark.parametrize("power", [pytest.param(0, marks=pytest.mark.full), 0.4])
 @pytest.mark.parametrize("name", ["rv", pytest.param("bev", marks=pytest.mark.full)])
 def test_a_stage_has_the_class_weights_of_its_scans_if_the_recipe_says_so(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, weighted: bool
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, power: float
 ) -> None:
     stages: list[NetworkStage] = []
 
@@ -54,11 +54,11 @@ def test_a_stage_has_the_class_weights_of_its_scans_if_the_recipe_says_so(
         raise InputError("enough")
 
     monkeypatch.setattr(networks, "fit", stop)
-    option = (f"--training.{name}.class_weights", str(weighted).lower())
+    option = (f"--training.{name}.class_weights", power)
     assert run_cli(*arguments(world, tmp_path, name, *option))[0] == 2
 
     (stage,) = stages
-    if not weighted:
+    if not power:
         assert stage.class_weights is None
         return
     counts = np.zeros(20, dtype=np.int64)
@@ -68,7 +68,7 @@ def test_a_stage_has_the_class_weights_of_its_scans_if_the_recipe_says_so(
         assert labels is not None
         counts += np.bincount(labels, minlength=20)
     assert stage.class_weights is not None
-    np.testing.assert_array_equal(stage.class_weights, class_weights(counts[1:]))
+    np.testing.assert_array_equal(stage.class_weights, class_weights(counts[1:], power))
 
 
 def test_the_loss_of_the_head_equals_its_formula() -> None:

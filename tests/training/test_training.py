@@ -468,7 +468,7 @@ def test_a_broken_label_file_is_one_line_of_error_from_a_reading_process_too(
     label = data / "sequences/00/labels/000001.label"
     np.full(499, CAR, np.uint32).tofile(label)  # of 500 points
 
-    options = ("--stage", "rv", "--training.rv.class_weights", "false", "--training.workers", 1)
+    options = ("--stage", "rv", "--training.rv.class_weights", 0, "--training.workers", 1)
     error = refusal(
         "train", world / "recipe.yaml", "--data", data, "--out", tmp_path / "run", *options
     )

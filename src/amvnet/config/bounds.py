@@ -33,6 +33,7 @@ class Range:
 MAX_TEXT_LENGTH = 200  # largest number of characters in a text from a file
 MAX_ITEMS = 12  # largest number of values in a list, such as the channels of a network's layers
 Count = Annotated[int, Range(1, 1_000_000)]  # number of items; the limit is far above any use
+Seed = Annotated[int, Range(0, 2**32 - 1)]  # seed of all random numbers
 Share = Annotated[float, Range(0, 1)]  # share of a whole
 
 

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from amvnet.config.bounds import Bounded, Range, Share
+from amvnet.config.bounds import Bounded, Range, Seed, Share
 
 StageName = Literal["rv", "bev", "head"]
 
@@ -305,8 +305,8 @@ class NetworkTraining(Bounded):
     """Weight of the region loss (Dice or Lovász-softmax) relative to cross-entropy (open)."""
     region_loss: Literal["default", "dice", "lovasz"] = "default"
     """The region loss. default: the paper's loss, Dice for rv and Lovász-softmax for bev."""
-    class_weights: bool = True
-    """Weight the classes by the square root of their inverse frequency; off for the ablation."""
+    class_weights: Share = 0.5
+    """Power of the inverse frequency that weighs a class; 0.5 is its square root. 0: no weights."""
     clip: Annotated[float, Range(0, 1e6, open=True)] = 5.0
     """Largest norm of the gradient; larger gradients are scaled down (open)."""
     ema: Annotated[float, Range(0, 0.99999)] = 0.0
@@ -387,7 +387,7 @@ class TrainingConfig(Bounded):
     last: the last epoch."""
     others: Share = 0.0
     """Share of an epoch that the second and later --data take together; 0: take all their scans."""
-    seed: Annotated[int, Range(0, 2**32 - 1)] = 0
+    seed: Seed = 0
     """Seed of the initial weights, the order of the scans in an epoch and the augmentation."""
     workers: Annotated[int, Range(0, 1024)] = 0
     """Number of worker processes that read and augment scans; 0: the training itself does it."""

@@ -115,7 +115,7 @@ def _name(gru: bool, weighted: bool) -> str:
 
 def _ablated(recipe: Recipe, gru: bool, weighted: bool) -> Recipe:
     range_net = dataclasses.replace(recipe.model.range_net, gru=gru)
-    rv = dataclasses.replace(recipe.training.rv, class_weights=weighted)
+    rv = dataclasses.replace(recipe.training.rv, class_weights=0.5 if weighted else 0.0)
 
     return dataclasses.replace(
         recipe,

@@ -24,14 +24,14 @@ FREQUENCY_FLOOR = 1e-4
 MIN_ERROR = 1e-3
 
 
-def class_weights(counts: NDArray[np.number]) -> NDArray[np.float32]:
-    """Return the square roots (K,) of the inverse frequencies of the classes, with a mean of 1.
+def class_weights(counts: NDArray[np.number], power: float = 0.5) -> NDArray[np.float32]:
+    """Return powers (K,) of the inverse frequencies of the classes, with a mean of 1.
 
     Frequencies below `FREQUENCY_FLOOR` are raised to it; the frequency of an absent class is 0.
-    This is section 4.2 of the paper.
+    Section 4.2 of the paper takes the square roots.
     """
     frequency = np.maximum(counts / max(counts.sum(), 1), FREQUENCY_FLOOR)
-    weights = 1 / np.sqrt(frequency)
+    weights = frequency**-power
     scaled: NDArray[np.float32] = (weights / weights.mean()).astype(np.float32)
     return scaled
 

@@ -269,7 +269,8 @@ def train_network(plan: Plan, checked: Checked, name: str, weights: Weights) -> 
     model = plan.build(weights)
     loaders = make_loaders(plan, config, weights.expects)
     # The class weights of the loss (section 4.2 of the paper).
-    loss_weights = class_weights(checked.class_counts) if config.class_weights else None
+    power = config.class_weights
+    loss_weights = class_weights(checked.class_counts, power) if power else None
     rivals = rival_classes(checked.taught)
     stage = make_stage(plan, name, model, loss_weights, rivals)
     for line in _notes(plan, name, checked.taught, rivals):

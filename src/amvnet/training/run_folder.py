@@ -143,7 +143,7 @@ def write_record(plan: Plan, counts: np.ndarray) -> None:
     """Write the entry of this call into run.yaml, recipe.yaml, and the points of each class.
 
     Args:
-        counts: (K,) counts of points by class, which `weights.calibrate` reads.
+        counts: (K,) counts of points by class, from which later calls take their class weights.
     """
     specs = plan.data.specs
     entry: dict[str, Any] = {

@@ -17,8 +17,8 @@ UNUSUAL_ODDS = 4.0
 FEW_UNCERTAIN = 0.01
 # The mean entropy of a network that the built-in weights have on real scans of their sensor, by its
 # part of the weights, and the ratio of its odds above which labels are doubtful. In another frame,
-# the range view has 0.57 to 0.66 and the bird's-eye view 0.24 to 0.37 (docs/log.md).
-USUAL_ENTROPY = {"range_net": 0.25, "polar_net": 0.155}
+# the range view has 0.40 to 0.55 and the bird's-eye view 0.35 to 0.48 (docs/log.md).
+USUAL_ENTROPY = {"range_net": 0.15, "polar_net": 0.22}
 UNUSUAL_ENTROPY_ODDS = 1.6
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from amvnet.cli.console import on_terminal, progress, report
 from amvnet.cli.options import LabelledChoice, ScanChoice, SensorChoice, load_segmenter
-from amvnet.config.bounds import Count, Share
+from amvnet.config.bounds import Count, Seed, Share
 from amvnet.engines.compute import Compute
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def adapt(
     loose: bool = False,
     epochs: Count | None = None,
     streets: Share = 0.5,
-    seed: Count | None = None,
+    seed: Seed | None = None,
     val: str | None = None,
     val_sequences: tuple[str, ...] | None = None,
     resume: bool = False,

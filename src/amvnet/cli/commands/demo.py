@@ -7,6 +7,7 @@ from pathlib import Path
 from amvnet.cli.commands.evaluate import show_evaluation
 from amvnet.cli.console import progress, report, report_lines
 from amvnet.cli.options import WEIGHTS
+from amvnet.config.bounds import Seed
 
 SEED = 20_201_209  # the default seed, far from the seeds of the built-in weights' training streets
 SCANS = 2  # number of scans of each street
@@ -20,7 +21,7 @@ IoU says how well a class is found; accuracy is the share of points with the rig
 
 
 def demo(
-    out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS, overwrite: bool = False
+    out: Path = Path("demo"), seed: Seed = SEED, weights: str = WEIGHTS, overwrite: bool = False
 ) -> None:
     """Simulate streets, segment them, score the labels, and write a page that shows them in 3D.
 

@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, report
-from amvnet.config.bounds import Count, Range
+from amvnet.config.bounds import Count, Range, Seed
 from amvnet.progress import counted
-
-Seed = Annotated[int, Range(0, 2**64)]
 
 
 def simulate(

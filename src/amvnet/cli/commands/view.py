@@ -7,6 +7,7 @@ from typing import Literal
 
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
+from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
 from amvnet.models.methods import widest_method
@@ -22,7 +23,7 @@ def view(
     labels: Path | None = None,
     weights: str | None = None,
     html: Path | None = None,
-    scans: int = 5,
+    scans: Count = 5,
     taxonomy: Literal["semantickitti", "nuscenes"] | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -60,8 +61,6 @@ def view(
             "expected no --taxonomy together with --weights, which define their classes; "
             "leave it out"
         )
-    if scans < 1:
-        raise InputError(f"expected --scans of 1 or more, found {scans}; give --scans 5")
     sensor = sensor_choice.parse()
     # Check this before any scan is segmented, so that no time is wasted.
     if html is not None:
