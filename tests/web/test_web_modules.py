@@ -8,7 +8,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
@@ -72,6 +72,7 @@ class Case:
     weights: str = "sim-hdl64e"
     rows: Literal["elevation", "laser", "ring"] | None = None
     intensity: TrainedIntensity | None = None
+    sensor: dict[str, Any] = field(default_factory=dict)
 
     @property
     def expected(self) -> Expectation:
@@ -81,7 +82,8 @@ class Case:
         # Coarse images have hidden points.
         view = dataclasses.replace(view, rows=rows, width=view.width // 8, hidden=0.02)
         intensity = self.intensity or expected.intensity
-        return dataclasses.replace(expected, view=view, intensity=intensity)
+        sensor = dataclasses.replace(expected.sensor, **self.sensor)
+        return dataclasses.replace(expected, view=view, intensity=intensity, sensor=sensor)
 
 
 def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
@@ -177,6 +179,12 @@ def on_the_car_of_nuscenes_in_millimetres(folder: Path) -> Case:
     return Case(folder / "own_car.npy", "sim-hdl32e", rows="ring")
 
 
+def of_few_points_on_the_car_of_nuscenes(folder: Path) -> Case:
+    """Of every seventh point, too few are distant to know the lasers."""
+    points, laser = on_nuscenes_car(share=0.4, steps=20)
+    return Case(write_bin(folder / "few_own.pcd.bin", with_ring(points, laser)), "sim-hdl32e")
+
+
 def near_points_alone(folder: Path) -> Case:
     points, laser = on_nuscenes_car()
     near = np.hypot(points[:, 0], points[:, 1]) < 1
@@ -248,6 +256,40 @@ def of_half_the_lasers(folder: Path) -> Case:
     return Case(path, "sim-hdl32e", rows="laser")
 
 
+def with_dead_lasers(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    is_alive = laser % 3 != 1
+    path = write_bin(folder / "dead.pcd.bin", with_ring(points, laser)[is_alive])
+    return Case(path, "sim-hdl32e", rows="laser")
+
+
+def with_raised_lasers(first: int, steps: int, folder: Path) -> Case:
+    """The lasers from the first one on look higher by steps between lasers."""
+    elevations = LASERS["hdl32e"] + steps * np.diff(LASERS["hdl32e"])[0] * (np.arange(32) >= first)
+    points, laser = place(elevations, 1.84, steps=300)
+    path = write_bin(folder / "raised.pcd.bin", with_ring(points, laser))
+    return Case(path, "sim-hdl32e", rows="ring")
+
+
+def with_rings_and_places_of_lost_returns(folder: Path) -> Case:
+    """With the lost returns, the rings would be too many, and the car's body would show."""
+    case = with_raised_lasers(12, 2, folder)
+    table = np.fromfile(case.file, np.float32).reshape(-1, 5)
+    table[::9, :3] = (0.3, 0.3, -0.5)
+    table[::5, :3] = 0
+    table[::5, 4] = 40
+    return dataclasses.replace(case, file=write_bin(case.file, table), rows="laser")
+
+
+def of_a_wider_view(folder: Path) -> Case:
+    points, laser = place([*np.linspace(-24, 2, 60), 5, 8, 12, 15], 1.73)
+    return Case(write_bin(folder / "wider.bin", with_ring(points, laser)), rows="laser")
+
+
+def for_another_sensor(make: Callable[[Path], Case], sensor: dict[str, Any], folder: Path) -> Case:
+    return dataclasses.replace(make(folder), sensor=sensor)
+
+
 def on_a_tilted_sensor(folder: Path) -> Case:
     """The lasers keep to their elevations in the file, and not when the ground is level."""
     points, laser = place(HDL64E, 1.73, slope=4)
@@ -309,6 +351,10 @@ CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "glued": lambda points: np.concatenate([points, points * [-1, -1, 1, 1]]),
     "coincident": gather,
     "of_12_bits": lambda points: np.column_stack([points[:, :3], points[:, 3] * 4095 // 1]),
+    "of_8_bits": lambda points: np.column_stack([points[:, :3], points[:, 3] * 255 // 1]),
+    "of_zeros": lambda points: points * [1, 1, 1, 0],
+    "of_one_height": lambda points: points * [1, 1, 0, 1] - [0, 0, 1.7, 0],
+    "of_few_points_and_lost_ones": lambda points: np.concatenate([points[::6], 0 * points[:900]]),
     "of_1_point": lambda points: points[:1],
     "of_2_points": lambda points: points[:2],
     "of_16_points": lambda points: points[:16],
@@ -420,6 +466,7 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     nuscenes_like,
     on_the_car_of_nuscenes,
     on_the_car_of_nuscenes_in_millimetres,
+    of_few_points_on_the_car_of_nuscenes,
     near_points_alone,
     near_points_of_another_sensor,
     with_lasers_in_a_column,
@@ -431,6 +478,9 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     with_a_ring_of_a_few_points,
     of_more_lasers,
     of_half_the_lasers,
+    with_dead_lasers,
+    with_rings_and_places_of_lost_returns,
+    of_a_wider_view,
     on_a_tilted_sensor,
     with_random_rings,
     with_random_rings_of_a_few_points,
@@ -462,6 +512,14 @@ for near, radius, (name, order) in product((0, 9), (0.9, 0.0), RING_ORDERS.items
 for make, is_optional in product((kitti_like, without_intensity, bright), (False, True)):
     name = f"other_{make.__name__}_{is_optional}"
     MAKERS[name] = partial(for_weights_that_match_nothing, make, is_optional)
+for first, steps in ((12, 2), (20, 2), (16, 1), (16, 2)):
+    MAKERS[f"raised_{first}_{steps}"] = partial(with_raised_lasers, first, steps)
+UNKNOWN_SENSORS: dict[str, dict[str, Any]] = {
+    "unnamed": {"name": ""},
+    "of_unknown_ends": {"fov_up": None, "fov_down": None},
+}
+for name, (what, sensor) in product(("raised_12_2", "of_fewer_lasers"), UNKNOWN_SENSORS.items()):
+    MAKERS[f"{name}_{what}"] = partial(for_another_sensor, MAKERS[name], sensor)
 WITH_VIEWS = ("kitti_like", "nuscenes_like", "higher_with_lost_returns")
 Made = tuple[Case, dict[str, Any]]  # a scan, and what the page makes of it
 
@@ -624,6 +682,7 @@ NUMBERS: dict[str, dict[str, float]] = {
         "FARTHEST": scans.FARTHEST,
         "LEAST_POINTS": lasers.MIN_POINTS,
         "LEAST_OWN": own_body.LEAST_OWN,
+        "QUICK_STEP": frame.QUICK_STEP,
         "SAME_BEAMS": lasers.SAME_BEAMS,
     },
     "sensor/rows.js": {
@@ -664,6 +723,18 @@ def test_formats_give_the_points_of_the_package(name: str, tmp_path: Path) -> No
     scan, line = normalised(case)
     assert page["text"] == NO_OTHERS.sub("", line)
     assert np.allclose(page["points"].reshape(-1, 4)[:, :3], scan.points[:, :3], atol=1e-6)
+
+
+def test_a_flag_before_the_coordinates_is_passed_over(tmp_path: Path) -> None:
+    WRITERS["ascii.ply"](tmp_path / "plain.ply", some_points(3000))
+    header, rows = (tmp_path / "plain.ply").read_bytes().split(b"end_header\n")
+    header = header.replace(b"property float x", b"property bool valid\nproperty float x")
+    flagged = b"".join(b"1 " + row for row in rows.splitlines(keepends=True))
+    (tmp_path / "flagged.ply").write_bytes(header + b"end_header\n" + flagged)
+
+    cases = [Case(tmp_path / "plain.ply"), Case(tmp_path / "flagged.ply")]
+    plain, page = run_page(cases, tmp_path)
+    assert np.array_equal(page["points"], plain["points"])
 
 
 def test_integers_of_any_size_are_read(tmp_path: Path) -> None:
@@ -768,6 +839,7 @@ def broken_files(folder: Path) -> list[Path]:
         "swapped.pcd": packed[:400] + packed[500:600] + packed[400:500] + packed[600:],
         "claims.pcd": pcd.replace(b"POINTS 3000", b"POINTS 9999999999"),
         "names.pcd": pcd.replace(b"FIELDS x y z", b"FIELDS a b c"),
+        "hexadecimal.pcd": text.replace(b"DATA ascii\n", b"DATA ascii\n0x1 1 1 1\n"),
         "encoding.pcd": pcd.replace(b"DATA binary", b"DATA zipped"),
         "types.pcd": pcd.replace(b"TYPE F F", b"TYPE F Q"),
         "header.pcd": pcd[:40],

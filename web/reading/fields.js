@@ -67,7 +67,7 @@ function asType(values, type) {
 
 function numberOf(word = "") {
   const value = Number(word);
-  if (word && !Number.isNaN(value)) return value;
+  if (/^[-+.\de]+$/i.test(word) && !Number.isNaN(value)) return value;  // no hexadecimal number
   const special = /^([+-]?)(nan|inf|infinity)$/i.exec(word);
   if (!special) throw new Error(`could not convert '${word.slice(0, 20)}' to a number`);
   if (special[2].toLowerCase() === "nan") return NaN;

@@ -4,9 +4,9 @@ import { InputError, quoted } from "../errors.js";
 import { checkPointCount, makeCloud, requireColumns } from "./cloud.js";
 import { Header, readBinary, readText, recordSize, wholeOf } from "./fields.js";
 
-// The types by PLY's names; each type has two names.
+// The types by PLY's names; most types have two names.
 const TYPES = {
-  char: "i1", int8: "i1", uchar: "u1", uint8: "u1", short: "i2", int16: "i2", ushort: "u2", uint16: "u2",
+  char: "i1", int8: "i1", uchar: "u1", uint8: "u1", bool: "u1", short: "i2", int16: "i2", ushort: "u2", uint16: "u2",
   int: "i4", int32: "i4", uint: "u4", uint32: "u4", float: "f4", float32: "f4", double: "f8", float64: "f8",
 };
 const FORMATS = ["ascii", "binary_little_endian", "binary_big_endian"];

@@ -11,6 +11,7 @@ import { quantilesOf } from "./statistics.js";
 const FARTHEST = 10_000;  // the limit of coordinates, metres; no LiDAR sees so far
 const LEAST_POINTS = 100;  // the least number of points on which a sensor is measured
 const LEAST_OWN = 0.15;  // the least share of a scan's points that shows the body of the car
+const QUICK_STEP = 7;  // the step between the points that show the lasers of such a scan
 // The body of nuScenes' car in the frame of its files, metres, and the field of view of its sensor.
 const BODY = { low: [-0.71, -1.18, -0.93], high: [0.71, 2.07, 0.01], sensor: { beams: 32, fov_up: 10.67, fov_down: -30.67 } };
 const SAME_BEAMS = 1.4;  // the largest ratio of two numbers of lasers that are alike
@@ -35,7 +36,7 @@ export function normalise(cloud, expected) {
   const rows = rowsOf(seen, tilted(seen, frame), ring, lasers, expected);
 
   fillIntensity(points);
-  const kept = withoutOwn(raised(points, toTrained), rows, places, { xyz, lasers, unit: frame.unit });
+  const kept = withoutOwn(raised(points, toTrained), rows, places, cloud, frame.unit);
   matchIntensity(kept.points, expected.intensity);
   const texts = [map.text, missingText(cloud), negativeText(cloud), ...frameTexts(frame)];
   texts.push(heightText(frame, sensor.height), fault, lasersText(lasers));
@@ -64,14 +65,13 @@ function validPoints(xyz, intensity, name) {
  * Return {points, rows, places} of the points outside the car's own body, if the scan shows a body that is known:
  * nuScenes' car, which has many points of every scan.
  */
-function withoutOwn(points, rows, places, { xyz, lasers, unit }) {
-  const isOwn = (place) => [0, 1, 2].every((axis) => {
-    const value = xyz[3 * place + axis] * UNITS[unit];
-    return value >= BODY.low[axis] && value <= BODY.high[axis];
-  });
+function withoutOwn(points, rows, places, { xyz, ring, count }, unit) {
+  const pointAt = (place) => [...xyz.subarray(3 * place, 3 * place + 3).map((value) => value * UNITS[unit])];
+  const isOwn = (place) => pointAt(place).every((value, axis) => value >= BODY.low[axis] && value <= BODY.high[axis]);
   const kept = Uint32Array.from(places.keys()).filter((i) => !isOwn(places[i]));
-  const share = (places.length - kept.length) / (xyz.length / 3);
-  if (share < LEAST_OWN || lasers.fov_up === null || !isLikeOf(lasers, BODY.sensor)) return { points, rows, places };
+  const part = places.filter((place) => place % QUICK_STEP === 0), inFile = [...part].flatMap((place) => [...pointAt(place), 0]);
+  const lasers = lasersOf(Float64Array.from(inFile), ring && part.map((place) => ring[place]));
+  if ((places.length - kept.length) / count < LEAST_OWN || lasers.fov_up === null || !isLikeOf(lasers, BODY.sensor)) return { points, rows, places };
   const result = new Float32Array(4 * kept.length);
   kept.forEach((i, row) => result.set(points.subarray(4 * i, 4 * i + 4), 4 * row));
   return { points: result, rows: rows && Int32Array.from(kept, (i) => rows[i]), places: kept.map((i) => places[i]) };

@@ -1,6 +1,7 @@
 // Choose the rows of the points in the range image: by laser if the lasers are known, else by elevation.
 
 import { NEAREST } from "./ground.js";
+import { quantilesOf } from "./statistics.js";
 
 const OUTSIDE = 0.16;  // the largest share of points outside a field of view that is wide enough
 const SAME_ANGLE = 6;  // the largest difference of the ends of two fields of view that are alike, degrees
@@ -43,8 +44,8 @@ export function rowsOf(points, tilted, ring, lasers, { view, sensor, as_is: isAs
   if (!byElevation || (rings && !sensor.name)) return rings;
 
   const rows = Int32Array.from(elevations, (elevation) => rowAt(elevation, byElevation));
-  const isRing = rings && rows.filter((row, i) => row === rings[i]).length >= rows.length / 2;
-  return isRing ? rings : rows;
+  const offs = rings && rows.map((row, i) => Math.abs(row - rings[i])).sort();
+  return rings && quantilesOf(offs, [0.5])[0] < 1 ? rings : rows;
 }
 
 /**

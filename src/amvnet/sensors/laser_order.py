@@ -31,14 +31,13 @@ def lasers_by_order(points: np.ndarray, lasers: int) -> np.ndarray | None:
     front from right to left. The order counts only if it gives exactly as many lasers as the sensor
     has, and each laser keeps to one elevation, below the laser before it.
     """
-    if len(points) < MIN_POINTS * lasers:
-        return None
-
     x, y, z = np.ascontiguousarray(points[:, :3].T)
     slope = z / np.hypot(x, y)
     is_known = np.isfinite(slope)  # false for a lost return at the origin
     if not is_known.all():
         x, y, slope = x[is_known], y[is_known], slope[is_known]
+    if len(slope) < MIN_POINTS * lasers:
+        return None
 
     is_front = x > 0
     is_right = is_front & (y < 0)

@@ -337,7 +337,7 @@ def _trained_view(lasers: SensorGeometry, expected: Expectation) -> RangeViewCon
     """
     view = expected.view
     if view.rows != "ring":
-        return view
+        return dataclasses.replace(view, rows="elevation")
 
     ends = expected.lasers.field_of_view
     if ends is None and lasers.beams == view.height:
@@ -399,7 +399,7 @@ def _rows_by_laser(
         ring = lasers_by_order(seen.points[:, :3] @ turn, view.height)
         if ring is None and not np.array_equal(turn, np.eye(3)):
             ring = lasers_by_order(seen.points, view.height)
-    if ring is None or not view.has_laser_per_row(ring.max()):
+    if ring is None or not view.has_laser_per_row(ring[seen.valid].max()):
         return None
     return _rows_of_rings(ring, view)
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from amvnet.scan import Scan
+from amvnet.scan import Scan, at_origin
 from amvnet.sensors.frame import QUICK_STEP
 from amvnet.sensors.lasers import SensorGeometry, measure_lasers
 from amvnet.sensors.lidars import KNOWN_BODIES, KNOWN_SENSORS, Box, Sensor
@@ -33,6 +33,7 @@ def own_points(xyz: np.ndarray, ring: np.ndarray | None, sensor: Sensor) -> np.n
 
     for name, box in KNOWN_BODIES.items():
         own = is_inside(xyz, box)
+        own[at_origin(xyz)] = False  # lost returns
         if own.mean() >= LEAST_OWN:
             part = xyz[::QUICK_STEP, :3]  # enough to know the lasers
             placed = np.isfinite(part).all(axis=1)
