@@ -13,12 +13,12 @@ import hashlib
 import json
 import shutil
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 from amvnet.data.palette import DRAWN, UNLABELLED
 from amvnet.engines.export.onnx import export
+from amvnet.files import temporary_folder
 from amvnet.viewing.page import drawing, fill_page
 from lidarstreets import simulate
 
@@ -120,9 +120,9 @@ def sample() -> Path:
     """Return the path of a simulated scan in KITTI's format."""
 
     def make(folder: Path) -> None:
-        with tempfile.TemporaryDirectory() as city:
+        with temporary_folder() as city:
             simulate(city, scans=1, seed=SAMPLE_SEED, first_sequence=SAMPLE_STREET)
-            copy(next(Path(city).rglob("*.bin")), folder / "street.bin")
+            copy(next(city.rglob("*.bin")), folder / "street.bin")
 
     sources = sorted((ROOT / "src" / "lidarstreets").rglob("*"))
     return cached("sample", [path for path in sources if path.is_file()], make) / "street.bin"
@@ -137,14 +137,15 @@ def cached(name: str, sources: list[Path], make: Any) -> Path:
 
     folder = CACHE / f"{name}-{digest.hexdigest()[:16]}"
     if not folder.is_dir():
-        CACHE.mkdir(parents=True, exist_ok=True)
-        for old in CACHE.glob(f"{name}-*"):
-            shutil.rmtree(old, ignore_errors=True)
-        with tempfile.TemporaryDirectory(dir=CACHE) as temporary:
-            unfinished = Path(temporary) / name
-            unfinished.mkdir()
+        with temporary_folder(CACHE) as unfinished:
             make(unfinished)
-            unfinished.rename(folder)
+            try:
+                unfinished.rename(folder)
+            except OSError:
+                if not folder.is_dir():  # else another build was faster
+                    raise
+        for old in set(CACHE.glob(f"{name}-*")) - {folder}:
+            shutil.rmtree(old, ignore_errors=True)
     return folder
 
 

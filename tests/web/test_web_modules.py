@@ -223,7 +223,7 @@ def of_fewer_lasers(folder: Path) -> Case:
 
 def with_rings_from_the_highest(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
-    path = write_bin(folder / "reversed.pcd.bin", with_ring(points, 31 - laser))
+    path = write_bin(folder / "reversed.pcd.bin", with_ring(points, 31 - laser)[laser != 9])
     return Case(path, "sim-hdl32e", rows="ring")
 
 
@@ -250,7 +250,7 @@ def of_more_lasers(folder: Path) -> Case:
 
 
 def of_half_the_lasers(folder: Path) -> Case:
-    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    points, laser = on_nuscenes_car()
     ring = laser // 2  # as of 16 lasers between the same elevations
     path = write_bin(folder / "half.pcd.bin", with_ring(points, ring))
     return Case(path, "sim-hdl32e", rows="laser")
@@ -512,13 +512,13 @@ for near, radius, (name, order) in product((0, 9), (0.9, 0.0), RING_ORDERS.items
 for make, is_optional in product((kitti_like, without_intensity, bright), (False, True)):
     name = f"other_{make.__name__}_{is_optional}"
     MAKERS[name] = partial(for_weights_that_match_nothing, make, is_optional)
-for first, steps in ((12, 2), (20, 2), (16, 1), (16, 2)):
+for first, steps in ((12, 6), (12, 2), (20, 2), (15, 1), (10, 1)):
     MAKERS[f"raised_{first}_{steps}"] = partial(with_raised_lasers, first, steps)
 UNKNOWN_SENSORS: dict[str, dict[str, Any]] = {
     "unnamed": {"name": ""},
     "of_unknown_ends": {"fov_up": None, "fov_down": None},
 }
-for name, (what, sensor) in product(("raised_12_2", "of_fewer_lasers"), UNKNOWN_SENSORS.items()):
+for name, (what, sensor) in product(("raised_12_6", "of_fewer_lasers"), UNKNOWN_SENSORS.items()):
     MAKERS[f"{name}_{what}"] = partial(for_another_sensor, MAKERS[name], sensor)
 WITH_VIEWS = ("kitti_like", "nuscenes_like", "higher_with_lost_returns")
 Made = tuple[Case, dict[str, Any]]  # a scan, and what the page makes of it

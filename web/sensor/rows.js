@@ -33,7 +33,7 @@ export function rowsOf(points, tilted, ring, lasers, { view, sensor, as_is: isAs
   const byLaser = (each) => each && Int32Array.from(each, (laser) => view.height - 1 - laser);
   if (view.rows === "laser" && hasEndsOf(lasers, sensor)) {
     const each = ring ?? lasersByOrder(tilted, view.height) ?? lasersByOrder(points, view.height);
-    const highest = each ? Math.max(...new Set(each)) : -1;
+    const highest = Math.max(...new Set(each));
     if (highest >= LASERS_SEEN * view.height && highest < view.height) return byLaser(each);
   }
 
