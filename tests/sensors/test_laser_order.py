@@ -64,6 +64,8 @@ def test_another_order_or_number_of_lasers_gives_none() -> None:
     assert lasers_by_order(points, LASERS + 1) is None
     assert lasers_by_order(points, LASERS - 1) is None
     assert lasers_by_order(points[: 20 * LASERS], LASERS) is None
+    is_seen = np.arange(len(points)) % 4 == 0  # 50 points of each laser
+    assert lasers_by_order(points * is_seen[:, None], LASERS) is None
     assert lasers_by_order(np.zeros((0, 4), np.float32), LASERS) is None
     assert lasers_by_order(np.zeros((2000, 4), np.float32), LASERS) is None
 

@@ -56,6 +56,7 @@ def test_near_points_are_of_the_body_only_with_its_lasers_and_if_many(
     share: float, sensor: str
 ) -> None:
     points, laser = on_nuscenes_car(share, sensor)
+    points[::8, :3] = 0  # lost returns are of no body
     assert own_points(points, laser, Sensor()) is None
     assert not own_of(points).any()
 

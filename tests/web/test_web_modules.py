@@ -223,7 +223,7 @@ def of_fewer_lasers(folder: Path) -> Case:
 
 def with_rings_from_the_highest(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
-    path = write_bin(folder / "reversed.pcd.bin", with_ring(points, 31 - laser)[laser != 9])
+    path = write_bin(folder / "reversed.pcd.bin", with_ring(points, 31 - laser))
     return Case(path, "sim-hdl32e", rows="ring")
 
 
@@ -259,7 +259,7 @@ def of_half_the_lasers(folder: Path) -> Case:
 def with_dead_lasers(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
     is_alive = laser % 3 != 1
-    path = write_bin(folder / "dead.pcd.bin", with_ring(points, laser)[is_alive])
+    path = write_bin(folder / "dead.pcd.bin", with_ring(points, 31 - laser)[is_alive])
     return Case(path, "sim-hdl32e", rows="laser")
 
 
@@ -351,7 +351,12 @@ CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "glued": lambda points: np.concatenate([points, points * [-1, -1, 1, 1]]),
     "coincident": gather,
     "of_12_bits": lambda points: np.column_stack([points[:, :3], points[:, 3] * 4095 // 1]),
-    "of_8_bits": lambda points: np.column_stack([points[:, :3], points[:, 3] * 255 // 1]),
+    "of_8_bits": lambda points: np.column_stack(
+        [points[:, :3], np.minimum(points[:, 3] * 300 // 1, 255)]
+    ),
+    "of_half_the_intensities": lambda points: np.column_stack(
+        [points[:, :3], np.where(np.arange(len(points)) % 2, points[:, 3], np.nan)]
+    ),
     "of_zeros": lambda points: points * [1, 1, 1, 0],
     "of_one_height": lambda points: points * [1, 1, 0, 1] - [0, 0, 1.7, 0],
     "of_few_points_and_lost_ones": lambda points: np.concatenate([points[::6], 0 * points[:900]]),
@@ -414,6 +419,17 @@ def on_a_step(path: Path, radius: float, inner: float, outer: float) -> Case:
     x, y = rng.uniform(-25, 25, (2, 20_000))
     z = np.where(np.hypot(x, y) < radius, inner, outer) + 1.5 * (rng.random(len(x)) < 0.2)
     return Case(write_bin(path, np.column_stack([x, y, z, rng.random(len(x))])))
+
+
+def on_random_ground(seed: int, folder: Path) -> Case:
+    """A slope with a step, noise and bushes; several points of a cell are equally low."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-25, 25, (2, 3000))
+    z = rng.normal(0, 0.1, 2) @ [x, y] - rng.uniform(0.2, 3) + rng.normal(0, 0.04, len(x))
+    z += rng.uniform(0, 3, len(x)) * (rng.random(len(x)) < rng.uniform(0, 0.9))
+    z -= rng.uniform(0, 1) * (np.hypot(x, y) > rng.uniform(5, 20))
+    points = np.column_stack([x, y, z.round(1), rng.random(len(x))])
+    return Case(write_bin(folder / "random.bin", points))
 
 
 def on_a_bank(folder: Path) -> Case:
@@ -514,6 +530,7 @@ for make, is_optional in product((kitti_like, without_intensity, bright), (False
     MAKERS[name] = partial(for_weights_that_match_nothing, make, is_optional)
 for first, steps in ((12, 6), (12, 2), (20, 2), (15, 1), (10, 1)):
     MAKERS[f"raised_{first}_{steps}"] = partial(with_raised_lasers, first, steps)
+MAKERS |= {f"ground_{seed}": partial(on_random_ground, seed) for seed in range(20)}
 UNKNOWN_SENSORS: dict[str, dict[str, Any]] = {
     "unnamed": {"name": ""},
     "of_unknown_ends": {"fov_up": None, "fov_down": None},
@@ -737,13 +754,14 @@ def test_a_flag_before_the_coordinates_is_passed_over(tmp_path: Path) -> None:
     assert np.array_equal(page["points"], plain["points"])
 
 
-def test_integers_of_any_size_are_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("lasers", [32, 1])
+def test_integers_of_any_size_are_read(lasers: int, tmp_path: Path) -> None:
     points, laser = place(LASERS["hdl32e"], 1.84)
     kinds = {"x": "f8", "y": "f4", "z": "f8", "Intensity": "u2", "ring": "i8", "time": "u8"}
     table = np.zeros(len(points), list(kinds.items()))
     table["x"], table["y"], table["z"] = points[:, :3].T
     table["Intensity"] = points[:, 3] * 40_000
-    table["ring"] = laser
+    table["ring"] = laser % lasers
     fields = [(name, f"{kind[0].upper()} {kind[1]}", 1) for name, kind in kinds.items()]
     path = tmp_path / "mixed.pcd"
     path.write_bytes(pcd_bytes(table, fields))
@@ -752,7 +770,7 @@ def test_integers_of_any_size_are_read(tmp_path: Path) -> None:
     (page,) = run_page([case], tmp_path)
     scan, line = normalised(case)
     assert page["text"] == NO_OTHERS.sub("", line)
-    assert "32 lasers" in line
+    assert ("32 lasers" in line) == (lasers == 32)  # one laser alone is none
     assert np.array_equal(page["rows"], rows_of(case, scan))
 
 
@@ -767,10 +785,13 @@ def test_arrays_of_any_type_and_order_are_read(tmp_path: Path) -> None:
         "big": points.astype(">f4"),
         "millimetres": np.round(points * [1000, 1000, 1000, 255]).astype(np.int32),
         "rings": with_rings.astype(np.float32),
+        "second": points,
         "fortran_rings": np.asfortranarray(with_rings),
     }
     for name, array in arrays.items():
         np.save(tmp_path / f"{name}.npy", array)
+    with (tmp_path / "second.npy").open("wb") as file:
+        np.lib.format.write_array(file, points, version=(2, 0))
     cases = [Case(tmp_path / f"{name}.npy") for name in arrays]
     for case, page in zip(cases, run_page(cases, tmp_path), strict=True):
         scan, line = normalised(case)
@@ -822,12 +843,16 @@ def broken_files(folder: Path) -> list[Path]:
     nan = np.full_like(points, np.nan)
     far = points + np.array([5e5, 5e5, 0, 0], np.float32)
     floor = points[:, :3] * [1, 1, 0.001] - [0, 0, 9]
+    classes = np.arange(len(points)) % 9
 
     files = {
         "odd.bin": kitti[:-3],
         "letters.bin": b"not a scan at all, but a long text" * 300,
         "none.bin": b"",
         "nan.bin": nan.tobytes(),
+        "infinite.bin": (points + np.array([np.inf, 0, 0, 0], np.float32)).tobytes(),
+        "gaps.bin": with_ring(points, 20 * classes).astype(np.float32).tobytes(),
+        "whole.pcd.bin": with_ring(points.round(), classes).astype(np.float32).tobytes(),
         "map.bin": far.tobytes(),
         "centimetres.bin": (points * [100, 100, 100, 1]).astype(np.float32).tobytes(),
         "feet.bin": np.column_stack([floor, points[:, 3]]).astype(np.float32).tobytes(),

@@ -62,13 +62,12 @@ export function findFrame(xyz, name) {
   return frame;
 }
 
-/** Return points (3 n) in metres and in the package's axes; if anything changes, lost points become NaN. */
+/** Return points (3 n) in metres and in the package's axes. */
 export function toLevel(xyz, { unit, axes, pitch, roll }) {
   if (unit === "m" && axes === "x-forward" && !pitch && !roll) return xyz;
   const columns = [0, 1, 2].map((column) => AXES[axes].map((row) => row[column]));
   const turn = rotation(pitch, roll).map((row) => columns.map((column) => dot(row, column)));
   const metres = Float64Array.from(xyz, (value) => value * UNITS[unit]);
-  for (let i = 0; i < metres.length; i += 3) if (!metres[i] && !metres[i + 1] && !metres[i + 2]) metres[i] = NaN;
   return turned(metres, turn);
 }
 

@@ -5,8 +5,7 @@ export function quantilesOf(ascending, probabilities) {
   return probabilities.map((probability) => {
     const place = probability * (ascending.length - 1), low = Math.floor(place), share = place - low;
     const a = ascending[low], b = ascending[Math.min(low + 1, ascending.length - 1)];
-    // From the nearer end, so that the last bit is NumPy's.
-    return share < 0.5 ? a + (b - a) * share : b - (b - a) * (1 - share);
+    return a + (b - a) * share;
   });
 }
 
