@@ -842,6 +842,7 @@ def broken_files(folder: Path) -> list[Path]:
     kitti = points.tobytes()
     nan = np.full_like(points, np.nan)
     far = points + np.array([5e5, 5e5, 0, 0], np.float32)
+    WRITERS["binary.pcd"](folder / "map.pcd", far)
     floor = points[:, :3] * [1, 1, 0.001] - [0, 0, 9]
     classes = np.arange(len(points)) % 9
 
@@ -853,6 +854,7 @@ def broken_files(folder: Path) -> list[Path]:
         "infinite.bin": (points + np.array([np.inf, 0, 0, 0], np.float32)).tobytes(),
         "gaps.bin": with_ring(points, 20 * classes).astype(np.float32).tobytes(),
         "whole.pcd.bin": with_ring(points.round(), classes).astype(np.float32).tobytes(),
+        "map.pcd": (folder / "map.pcd").read_bytes(),
         "map.bin": far.tobytes(),
         "centimetres.bin": (points * [100, 100, 100, 1]).astype(np.float32).tobytes(),
         "feet.bin": np.column_stack([floor, points[:, 3]]).astype(np.float32).tobytes(),
