@@ -81,8 +81,7 @@ def raised(xyz: np.ndarray, labels: np.ndarray, is_ground: np.ndarray) -> np.nda
         level = max((np.roll(xyz, turn, axis=1) for turn in range(3)), key=_area)
         both = (ground & (_over_lowest(points) > RAISED) for points in (level, -level))
         is_raised = min(both, key=np.sum)
-    counts: np.ndarray = np.bincount(labels[is_raised], minlength=len(is_ground))
-    return counts
+    return np.bincount(labels[is_raised], minlength=len(is_ground))
 
 
 def _area(xyz: np.ndarray) -> int:

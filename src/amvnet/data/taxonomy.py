@@ -152,8 +152,7 @@ class Taxonomy:
                 f"expected the raw ids of {self.name} "
                 f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; {advice or usual}"
             )
-        checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
-        return checked
+        return train_ids.astype(np.uint8)
 
     def to_raw(self, ids: NDArray[np.integer]) -> NDArray[np.uint32]:
         """Return the raw ids (N,) uint32 of train ids (N,); raise InputError if one is wrong."""
@@ -164,8 +163,7 @@ class Taxonomy:
                 f"found {ids.min()}..{ids.max()}; give train ids of this taxonomy"
             )
 
-        raw_ids: NDArray[np.uint32] = np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
-        return raw_ids
+        return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON.

@@ -70,8 +70,7 @@ class VoxelTable:
     def means(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return the (M, C - 1) weighted means; the last sum of a voxel is its total weight."""
         sums = self._sums[self.rows(keys)]
-        means: NDArray[np.float32] = sums[:, :-1] / sums[:, -1:]
-        return means
+        return sums[:, :-1] / sums[:, -1:]
 
     def scans(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the number of scans (M,) that see each voxel."""
@@ -291,8 +290,7 @@ def keys_of(index: NDArray[np.int64]) -> NDArray[np.int64]:
     Voxels have the same number if they are a multiple of 2^21 voxels apart in x, y and z.
     """
     x, y, z = (index & ((1 << _BITS) - 1)).T
-    keys: NDArray[np.int64] = x << (2 * _BITS) | y << _BITS | z
-    return keys
+    return x << (2 * _BITS) | y << _BITS | z
 
 
 def index_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:

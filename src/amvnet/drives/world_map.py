@@ -185,8 +185,7 @@ class MapBuilder:
         """Return (K + 1,) bool: the classes whose points may move, by train id."""
         coarse = class_map("coarse")
         ids = [coarse.target.names.index(name) for name in MOVABLE]
-        is_movable: NDArray[np.bool_] = np.isin(coarse.table(self.taxonomy), ids)
-        return is_movable
+        return np.isin(coarse.table(self.taxonomy), ids)
 
 
 def check_ending(path: Path) -> None:

@@ -78,8 +78,7 @@ class Engine:
         """Return the scores of the points of a batch, which is on the device of the engine."""
         model = self.model
         if METHODS[self.method].has_two_networks:
-            scores: Scores = model(batch)
-            return scores
+            return model(batch)
         if self.method == "bev":
             g = model.score_polar(model.polar_view.project(batch))
             return Scores(g, _none_uncertain(g), rv=None, bev=g)

@@ -131,8 +131,7 @@ class Segmentation:
     @property
     def confidence(self) -> NDArray[np.float32]:
         """(N,) probability of each point's label, in [0, 1]; 0 for points that are not valid."""
-        largest: NDArray[np.float32] = self.probabilities.max(axis=1, initial=0)
-        return largest
+        return self.probabilities.max(axis=1, initial=0)
 
     @property
     def points(self) -> NDArray[np.floating]:
@@ -153,8 +152,7 @@ class Segmentation:
     @property
     def raw_ids(self) -> NDArray[np.uint32]:
         """(N,) the labels as ids of the benchmark's files (a car of SemanticKITTI is 10)."""
-        raw: NDArray[np.uint32] = self.require_origin().taxonomy.to_raw(self.labels)
-        return raw
+        return self.require_origin().taxonomy.to_raw(self.labels)
 
     @property
     def verdict(self) -> Verdict | None:

@@ -49,8 +49,7 @@ def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
     if not x.requires_grad:
         return _pad_width(x, left, right)
 
-    wrapped: Tensor = _WrapWidth.apply(x, left, right)  # type: ignore[no-untyped-call]
-    return wrapped
+    return _WrapWidth.apply(x, left, right)  # type: ignore[no-untyped-call]
 
 
 def _pad_width(x: Tensor, left: int, right: int) -> Tensor:

@@ -112,8 +112,7 @@ def _elevations_of_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[np.ndarray,
     """
 
     def means_of(values: np.ndarray) -> np.ndarray:
-        means: np.ndarray = np.bincount(ring, values) / np.maximum(np.bincount(ring), 1)
-        return means
+        return np.bincount(ring, values) / np.maximum(np.bincount(ring), 1)
 
     elevation = elevations(xyz)
 

@@ -151,7 +151,4 @@ def _with_laser_ends(
 
 def elevations(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the (N,) elevations of (N, 3) points, degrees above the horizon."""
-    degrees: NDArray[np.floating] = np.degrees(
-        np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
-    )
-    return degrees
+    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))

@@ -53,8 +53,7 @@ class BagPoses:
 
     def times(self) -> list[float]:
         """Return the time stamps of the scans in seconds; raise InputError if one is broken."""
-        times: list[float] = self._call(read_times, self.scan_topic)["times"].tolist()
-        return times
+        return self._call(read_times, self.scan_topic)["times"].tolist()
 
     def odometry(self) -> str | None:
         """Return the first topic with odometry, or None if there is none."""
@@ -91,8 +90,7 @@ class BagPoses:
         return _by_odometry(name, transforms, found["frame"], found["times"], report)
 
     def _topics(self) -> dict[str, str]:
-        topics: dict[str, str] = self._call(pose_topics)["topics"]
-        return topics
+        return self._call(pose_topics)["topics"]
 
     def _call(self, function: Any, *arguments: Any) -> dict[str, Any]:
         with readable(self.path):
@@ -173,8 +171,7 @@ def _by_odometry(
             f"{shown(odometry.child)} to the scans' frame {shown(frame)}"
         )
         return poses
-    moved: Poses = poses @ np.linalg.inv(of_child[common]) @ of_lidar[common]
-    return moved
+    return poses @ np.linalg.inv(of_child[common]) @ of_lidar[common]
 
 
 def _climb(

@@ -59,8 +59,7 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     if ending == GZIP:
         return Cloud(**_call(read_gzip, path, ending, list(layout.columns), list(layout.dtypes)))
     if ending in ROW_READERS:
-        cloud: Cloud = _call(ROW_READERS[ending], path, ending, layout)
-        return cloud
+        return _call(ROW_READERS[ending], path, ending, layout)
     return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
 
 
@@ -73,8 +72,7 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     Raises:
         InputError: if the file is broken, lacks a column, or needs a package that is missing.
     """
-    columns: Arrays = _call(COLUMN_READERS[ending], path, ending, wanted)
-    return columns
+    return _call(COLUMN_READERS[ending], path, ending, wanted)
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
