@@ -60,16 +60,11 @@ class SomeBroken(Exception):
 
 @contextmanager
 def one_line_errors(
-    message: Callable[[BaseException], str],
-    only: tuple[type[Exception], ...] = (Exception,),
+    message: Callable[[BaseException], str], only: tuple[type[Exception], ...] = (Exception,)
 ) -> Iterator[None]:
-    """Turn exceptions that a library raises for bad input into an `InputError` of one line.
+    """Turn exceptions of some classes into an `InputError` of one line, which `message` returns.
 
-    An `InputError` passes unchanged, and so does an interruption by the user.
-
-    Args:
-        message: a function that returns the line for an exception.
-        only: the classes of exceptions to convert. Other exceptions pass unchanged.
+    An `InputError` passes unchanged, and so do other exceptions and an interruption by the user.
 
     Raises:
         InputError: if the block raises one of the exceptions to convert, or a library written in

@@ -225,9 +225,8 @@ class OnnxSegmenter:
         return softmax(np.concatenate(logits))
 
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
-        feed = {}
-        for entry, values in zip(self.description["graphs"][name]["inputs"], inputs, strict=True):
-            feed[entry["name"]] = values
+        names = [entry["name"] for entry in self.description["graphs"][name]["inputs"]]
+        feed = dict(zip(names, inputs, strict=True))
         return np.asarray(self._graphs[name].run(None, feed)[0])
 
 

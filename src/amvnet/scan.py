@@ -148,15 +148,14 @@ def check_scan(scan: Scan) -> Scan:
     return scan
 
 
-def check_trainable(scan: Scan) -> int:
-    """Return the number of valid points; raise InputError if no network can be trained on them."""
+def check_trainable(scan: Scan) -> None:
+    """Raise InputError if no network can be trained on a scan."""
     valid = int(scan.valid.sum())
     if valid < 2:  # batch norm needs two points to compute a variance
         raise InputError(
             f"{scan.name}: expected at least two valid points to train with, found {valid}; "
             "leave the scan out"
         )
-    return valid
 
 
 class TensorLike(Protocol):

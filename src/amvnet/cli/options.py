@@ -142,11 +142,7 @@ class TrainingChoice:
 
 
 def report_unused(source: Source, title: str = "") -> None:
-    """Report the scans of a dataset that a training does not use.
-
-    Args:
-        title: the beginning of each line.
-    """
+    """Report the scans that a training does not use, in lines that begin with `title`."""
     if source.unlabelled:
         report(f"{title}skipped for lack of labels: {describe_records(source.unlabelled)}")
     _report_unnamed(source, title)
@@ -220,12 +216,6 @@ class LabelChoice:
         self, weights: Weights, choice: ScanChoice, sensor_choice: SensorChoice, compute: Compute
     ) -> LabellingRequest:
         """Return the request for labels by some weights.
-
-        Args:
-            weights: the weights.
-            choice: which scans to read, and how files hold them.
-            sensor_choice: what is known about the sensor.
-            compute: where and how the networks are computed.
 
         Raises:
             InputError: if a value cannot be parsed, or does not fit the weights.

@@ -47,9 +47,6 @@ def neighbours(xyz: np.ndarray, labels: np.ndarray, size: int) -> np.ndarray:
 def following(counts: np.ndarray) -> np.ndarray:
     """Return the shares of neighbours with the same label beyond what chance gives, at most 1.
 
-    Args:
-        counts: (2, K + 1) counts of `neighbours`.
-
     Returns:
         (K + 2,) the share of each train id, and last the share of all points; random labels have
         about 0, and NaN says that too few points have neighbours.

@@ -299,16 +299,13 @@ def _built_in() -> dict[str, Taxonomy]:
     taxonomies = {}
     for name, table in tomllib.loads(text).items():
         entries = table["classes"].values()
-        raw_to_train = []
-        for train_id, entry in enumerate(entries):
-            for raw in entry["raw"]:
-                raw_to_train.append((raw, train_id))
-
         fields = {
             "name": name,
             "classes": list(table["classes"])[1:],
             "colors": map(itemgetter("color"), entries),
-            "raw_to_train": raw_to_train,
+            "raw_to_train": [
+                (raw, ids) for ids, entry in enumerate(entries) for raw in entry["raw"]
+            ],
             "train_to_raw": map(itemgetter("id"), entries),
         }
         taxonomies[name] = Taxonomy.from_dict({**table, **fields})

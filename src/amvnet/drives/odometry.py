@@ -75,10 +75,7 @@ def check_fit(pairs: Iterable[Pair], name: str) -> None:
     """Check that poses fit the scans: that the surfaces of two scans meet in the world.
 
     With wrong poses, each wall is seen twice, and another motion brings the scans closer together:
-    none, a shorter one or a longer one.
-
-    Args:
-        name: the name of the poses in the message.
+    none, a shorter one or a longer one. The message begins with `name`.
 
     Raises:
         InputError: if the poses do not fit.

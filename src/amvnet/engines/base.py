@@ -34,12 +34,10 @@ class Engine:
     networks, and builds a model with these networks.
 
     Args and attributes:
-        name: the name of the engine: "torch", "onnx" or "int8".
-        model: AMVNet, whose two networks the engine runs.
+        name: "torch", "onnx" or "int8".
         method: how the points are scored, one of `METHODS`.
         tau: the threshold of the assertion, in [0, 1]; None if it is the threshold of the weights.
         device: the device that holds the points: "cpu", "cuda", "cuda:1", ...
-        precision: the precision of the two networks.
 
     Attributes:
         at_once: the number of scans to segment at the same time, each with its share of torch's

@@ -148,19 +148,11 @@ def measure_doubts(scan: Scan, segmenter: Segmenter) -> PointDoubts:
 def _contradiction(
     f: torch.Tensor, g: torch.Tensor, label: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return how strongly both views contradict the labels, and the class that they agree on.
+    """Return how strongly both views (P, K) contradict the labels, and the class they agree on.
 
     Each view gives a probability to the class that both agree on, and a probability to the label.
     The contradiction is the smaller probability of the class minus the larger probability of the
-    label. It is 0 if this difference is negative, or if the point has no label.
-
-    Args:
-        f: (P, K) class probabilities of the range view.
-        g: (P, K) class probabilities of the bird's-eye view.
-        label: (P,) train ids.
-
-    Returns:
-        (P,) contradictions in [0, 1] and (P,) train ids.
+    label, in [0, 1]. It is 0 if this difference is negative, or if the point has no label.
     """
     agreed = (f * g).argmax(dim=1)
     column = (label.long() - 1).clamp_min(0)

@@ -55,9 +55,7 @@ class Rules:
     """What an archive must and may contain.
 
     Attributes:
-        taxonomy: the classes.
         points: the number of points of each required prediction, by the name of its file.
-        dtype: the number type of the ids.
         unlabelled: whether points may have no class (train id 0).
         folders: names of the entries for folders, outer folders first, each with a trailing slash.
         meta: name of submission.json, which declares what the method uses; None if the benchmark
@@ -86,10 +84,6 @@ class Rules:
 
 def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = None) -> Rules:
     """Return the rules for the archive of one split, or of some sequences.
-
-    Args:
-        split: a split. The servers score "test"; other splits are for trials.
-        sequences: sequences or scenes to pack instead of a split.
 
     Raises:
         InputError: if the dataset's benchmark has no server, or the dataset has no such scans.
@@ -171,10 +165,7 @@ RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuS
 
 
 def _count_points(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, int]:
-    points = {}
-    for record in records:
-        points[record.prediction] = dataset.count_points(record)
-    return points
+    return {record.prediction: dataset.count_points(record) for record in records}
 
 
 def write_archive(
@@ -190,13 +181,10 @@ def write_archive(
     scores or other splits, are left out. Only one scan at a time is in memory.
 
     Args:
-        rules: the rules of the benchmark's server.
         folder: folder with the predictions, under the file names of `rules`.
         out: the archive, NAME.zip. It appears whole or not at all.
         use_external: whether the method also learnt from data outside the benchmark. Only archives
             for nuScenes state it.
-        progress: called before each file and at the end, with the number of files that are done and
-            their total.
 
     Raises:
         InputError: if a prediction is missing or breaks the rules, or the archive cannot be

@@ -43,7 +43,6 @@ class ScoreFolder:
         side: "a" or "b". In a file of `amvnet predict --scores`, a is the range-view network, and b
             is the bird's-eye-view network.
         folder: the folder of the files, in the layout of `amvnet predict --scores`.
-        logits: whether the scores are logits instead of probabilities.
 
     Raises:
         InputError: if there is no such folder.
@@ -160,10 +159,6 @@ def as_probabilities(values: np.ndarray, name: str, advice: str) -> np.ndarray:
 
     Other tools write a row of zeros for a point outside their view: the model has no opinion of it.
     Such a row becomes 1/K in every class.
-
-    Args:
-        name: the beginning of error messages.
-        advice: the advice in the message if the scores are no probabilities.
 
     Raises:
         InputError: if a value is negative or not finite, a row does not add up to 1, or all rows

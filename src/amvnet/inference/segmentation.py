@@ -269,10 +269,8 @@ def scores_by_method(
 ) -> dict[str, Tensor]:
     """Return the scores (P, K) by a method and by the methods that it includes.
 
-    AMVNet and the ensembles include all ensembles and each single network.
-
-    Args:
-        vote: returns the scores by rv-knn, given the scores of the range view.
+    AMVNet and the ensembles include all ensembles and each single network. `vote` returns the
+    scores by rv-knn, given those of the range view.
     """
     f = scores.rv
     g = scores.bev

@@ -144,7 +144,6 @@ class AzimuthGRU(nn.Module):
     these copies are dropped.
 
     Args:
-        channels: C, number of channels of the map.
         padding: share of the columns that are copied, 0 to 1.
     """
 

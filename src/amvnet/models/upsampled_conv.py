@@ -26,7 +26,6 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     are s kernels. This is half of the work.
 
     Args:
-        convolution: the convolution, over C + C' channels.
         coarse: (B, C, h, w). It is really upsampled if H is not a multiple of h, or W is not a
             multiple of w.
         fine: (B, C', H, W).

@@ -65,9 +65,6 @@ def order_rings(scan: Scan) -> tuple[Scan, str]:
     lasers ascend. Some drivers count from the highest laser, or in the order in which the lasers
     fire. Rings that hold other numbers are left out.
 
-    Args:
-        scan: a scan with the sensor at the origin; the sensor may be tilted.
-
     Returns:
         The scan, and in words what was wrong and done; empty if the rings are in order.
     """

@@ -53,7 +53,6 @@ class Sensor:
 
     Attributes:
         name: the name of the sensor; messages state it.
-        beams: number of lasers.
         fov_up, fov_down: ends of the field of view, degrees above the horizon.
         height: height over the ground, metres.
         intensity_scale: the largest possible intensity.

@@ -44,7 +44,7 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
     if config.block_drop and rng.random() < config.block_drop:
         scan = _drop_blocks(scan, rng)
     if config.drop:
-        scan = _drop_points(scan, config.drop, rng)
+        scan = _keep(scan, rng.random(len(scan)) >= rng.uniform(0, config.drop))
 
     xyz = scan.points[:, :3] * (1 + rng.uniform(-config.scale, config.scale))
     mirrored = rng.random(2) < config.flip
@@ -179,12 +179,6 @@ def lasers(scan: Scan) -> np.ndarray:
     return np.searchsorted(borders, elevation, side="right")
 
 
-def _drop_points(scan: Scan, largest_share: float, rng: np.random.Generator) -> Scan:
-    """Drop a random share of the points, up to `largest_share`; keep all if none would be left."""
-    draws = rng.random(len(scan))
-    return _keep(scan, draws >= rng.uniform(0, largest_share))
-
-
 def _drop_lasers(scan: Scan, rng: np.random.Generator) -> Scan:
     """Drop every second laser, or a random share of the lasers up to `LARGEST_LASER_DROP`."""
     laser = lasers(scan)
@@ -257,6 +251,7 @@ def _spread(values: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _keep(scan: Scan, mask: np.ndarray) -> Scan:
+    """Drop the points outside a mask (N,), unless none would be left."""
     return scan.select(mask) if mask.any() else scan
 
 

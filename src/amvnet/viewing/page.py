@@ -81,9 +81,7 @@ class Packed:
 
 
 def show(
-    shown: Segmentation | Scan | AnyArray,
-    path: Path | str | None = None,
-    open_browser: bool = True,
+    shown: Segmentation | Scan | AnyArray, path: Path | str | None = None, open_browser: bool = True
 ) -> Path:
     """Write a page that shows a scan in 3D, open it, and return its path.
 
@@ -153,10 +151,7 @@ def open_page(path: Path) -> None:
 def write_page(
     path: Path | str, scans: Iterable[ShownScan], taxonomy: Taxonomy, title: str
 ) -> Evaluation:
-    """Write one self-contained page with some scans; the file appears whole or not at all.
-
-    Args:
-        scans: the scans, in the order of the page's slider.
+    """Write one self-contained page with some scans in order; the file appears whole or not at all.
 
     Returns:
         The evaluation of all labels that have a ground truth; the page shows it as a table.
@@ -254,10 +249,12 @@ def fill_page(
         "TITLE": html.escape(title),
         "STYLE": style,
         "SCRIPT": script,
-        "ABOUT": _json(about),
+        # JSON that cannot close the HTML element that contains it.
+        "ABOUT": json.dumps(about, separators=(",", ":")).replace("<", "\\u003c"),
         "SCANS": scans,
     }
-    return _fill(_source("page.html"), parts)
+    # In one pass: an @@NAME@@ within a part stays unchanged.
+    return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], _source("page.html"))
 
 
 def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, Any]:
@@ -399,16 +396,3 @@ def _hash(text: str) -> str:
     """Return the hash with which a content security policy allows this text and no other."""
     digest = hashlib.sha256(text.encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
-
-
-def _json(tree: Any) -> str:
-    """Return JSON that cannot close the HTML element that contains it."""
-    return json.dumps(tree, separators=(",", ":")).replace("<", "\\u003c")
-
-
-def _fill(template: str, parts: Mapping[str, str]) -> str:
-    """Replace each @@NAME@@ of a template by the part of that name.
-
-    The parts themselves are not searched: an @@NAME@@ within a part stays unchanged.
-    """
-    return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], template)

@@ -69,7 +69,7 @@ def _explain(data: np.ndarray, layout: RowLayout) -> tuple[str, str]:
     if len(data) % kitti and len(data) % nuscenes:
         found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
         advice = f"copy the file again if it is truncated, or {advice}"
-    elif _are_lost(data):
+    elif not np.isfinite(data.view(np.float32)).any():
         return "no finite number", "record the scan again"
 
     if len(data) % kitti == 0 and _are_millimetres(data):
@@ -159,11 +159,6 @@ def _kitti_table(data: np.ndarray) -> NDArray[np.float32]:
 def _are_millimetres(data: np.ndarray) -> bool:
     """Return whether the values of a file fit KITTI's layout if they are divided by 1000."""
     return _is_kitti(_kitti_table(data) * IN_METRES)
-
-
-def _are_lost(data: np.ndarray) -> bool:
-    """Return whether a file holds no finite float32; its size is a multiple of 4 bytes."""
-    return not np.isfinite(data.view(np.float32)).any()
 
 
 def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
