@@ -67,9 +67,7 @@ def some_cloud() -> Cloud:
 
 def named(name: str) -> InputScan:
     return FileScan(
-        NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud),
-        FileReader(None),
-        NUSCENES,
+        NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud), FileReader(None), NUSCENES
     )
 
 

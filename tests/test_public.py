@@ -364,8 +364,6 @@ def test_a_users_script_passes_strict_types_and_mistakes_do_not(tmp_path: Path) 
     printed = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
 
     errors = re.findall(r"^(\S+?):(\d+): error: .*\[([\w-]+)\]$", printed.stdout, re.M)
-    expected = []
-    for line, code in enumerate(WRONG.values(), start=2):
-        expected.append(("wrong.py", str(line), code))
+    expected = [("wrong.py", str(line), code) for line, code in enumerate(WRONG.values(), start=2)]
     assert errors == expected, printed.stdout + printed.stderr
     assert isinstance(InputError("a"), ValueError)

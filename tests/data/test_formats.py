@@ -456,10 +456,7 @@ def test_an_mcap_file_without_messages_of_ros_2_is_refused(tmp_path: Path) -> No
         strings = len(profile).to_bytes(4, "little") + profile + bytes(4)
         header = b"\x01" + len(strings).to_bytes(8, "little") + strings
         path.write_bytes(b"\x89MCAP0\r\n" + header + bytes(100))
-        fails(
-            lambda: Bag(path, ".mcap"),
-            "Profile is not ros2",
-        )
+        fails(lambda: Bag(path, ".mcap"), "Profile is not ros2")
 
 
 def test_the_offset_that_the_error_for_map_coordinates_names_helps(tmp_path: Path) -> None:

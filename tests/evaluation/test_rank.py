@@ -255,8 +255,7 @@ def test_scans_without_labels_are_refused(world: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("weights", "word"),
-    [("rv", "polar_net"), ("nuscenes", "classes"), ("none", "weights file")],
+    ("weights", "word"), [("rv", "polar_net"), ("nuscenes", "classes"), ("none", "weights file")]
 )
 def test_wrong_input_is_one_line_and_leaves_nothing(
     world: Path, tmp_path: Path, weights: str, word: str

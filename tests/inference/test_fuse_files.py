@@ -282,10 +282,7 @@ def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) ->
     arguments = ("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path)
     first = ("--scores-a", world / "predictions")
     second = ("--scores-b", world / "predictions")
-    cases = {
-        "--stage head": (*first, *second),
-        "--scores-b": (*first, "--stage", "head"),
-    }
+    cases = {"--stage head": (*first, *second), "--scores-b": (*first, "--stage", "head")}
     for word, options in cases.items():
         error = refusal(*arguments, *options)
         assert word in error

@@ -90,9 +90,7 @@ def test_a_stated_body_counts_for_any_sensor() -> None:
     points, laser = place(LASERS["vlp16"], 0.9)
     own = own_points(points, laser, Sensor(own_body=BOX))
     assert own is not None
-    expected = []
-    for x, y, z, _ in points:
-        expected.append(-1 <= x <= 14 and -2 <= y <= 5 and -0.5 <= z <= 0.6)
+    expected = [-1 <= x <= 14 and -2 <= y <= 5 and -0.5 <= z <= 0.6 for x, y, z, _ in points]
     assert own.tolist() == expected
     assert 0 < own.sum() < len(own)
     assert own_of(points, own_body="-1,-2,-0.5,14,5,0.6").tolist() == expected
