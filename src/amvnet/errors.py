@@ -6,7 +6,7 @@ import difflib
 import errno
 import re
 import reprlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -29,6 +29,12 @@ def shown(value: object) -> str:
     text.maxlevel = 2
     text.maxstring = text.maxother = 100
     return re.sub(r"\s*\n\s*", " ", text.repr(value))
+
+
+def listed(items: Sequence[str], limit: int) -> str:
+    """Return at most `limit` of some texts, separated by commas, and how many more there are."""
+    more = len(items) - limit
+    return ", ".join(items[:limit]) + (f" and {more} more" if more > 0 else "")
 
 
 def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") -> str:

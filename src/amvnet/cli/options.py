@@ -11,7 +11,7 @@ from amvnet.cli.console import report, silence
 from amvnet.cli.parser import flag_of
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
-from amvnet.errors import InputError
+from amvnet.errors import InputError, listed
 from amvnet.models.methods import MethodName
 from amvnet.progress import counted
 
@@ -351,8 +351,4 @@ def describe_records(records: Sequence[ScanRecord]) -> str:
     if not records:
         return "none"
     names = sorted({record.sequence for record in records})
-    text = ", ".join(names[:MAX_SEQUENCES])
-    if len(names) > MAX_SEQUENCES:
-        text += f" and {len(names) - MAX_SEQUENCES} more"
-
-    return f"{counted(len(records), 'scan')} of {text}"
+    return f"{counted(len(records), 'scan')} of {listed(names, MAX_SEQUENCES)}"

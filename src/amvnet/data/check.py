@@ -23,7 +23,7 @@ from amvnet.data.plausible import (
     scattered_classes,
 )
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, listed
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import check_trainable
@@ -156,11 +156,10 @@ class Report:
             )
         unknown = self.unknown
         if unknown:
-            texts = [describe_unknown(*item) for item in list(unknown.items())[:SHOWN_IDS]]
-            more = f" and {len(unknown) - SHOWN_IDS} more" if len(unknown) > SHOWN_IDS else ""
+            texts = [describe_unknown(*item) for item in unknown.items()]
             yield (
                 f"{self.spec}: expected ids of classes or of ignored points, found "
-                f"{', '.join(texts)}{more}; {_advice(self.taxonomy)}"
+                f"{listed(texts, SHOWN_IDS)}; {_advice(self.taxonomy)}"
             )
             return
 

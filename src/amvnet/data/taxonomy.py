@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amvnet.config.bounds import check_text
-from amvnet.errors import InputError, one_line_errors, shown
+from amvnet.errors import InputError, listed, one_line_errors, shown
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
@@ -139,18 +139,15 @@ class Taxonomy:
 
         unknown = np.unique(raw_ids[train_ids == UNKNOWN]).tolist()
         if unknown:
-            listed = ", ".join(map(str, unknown[:SHOWN]))
-            if len(unknown) > SHOWN:
-                listed += f" and {len(unknown) - SHOWN} more"
-
+            found = listed(list(map(str, unknown)), SHOWN)
             if raw_ids.max() <= self.size:
-                listed += " (train ids, it seems)"
+                found += " (train ids, it seems)"
             usual = "write its raw ids, or describe your own in a YAML file (docs/own_data.md)"
             if self.name not in TAXONOMIES:
                 usual = "add them to a class or to ignored, or write ignored: rest"
             raise InputError(
                 f"expected the raw ids of {self.name} "
-                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; {advice or usual}"
+                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {found}; {advice or usual}"
             )
         return train_ids.astype(np.uint8)
 
@@ -216,8 +213,7 @@ def describe_difference(classes: Sequence[str], others: Sequence[str], of_others
     texts = []
     for names, word in ((missing, "without"), (added, "with")):
         if names:
-            more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-            texts.append(f"{word} {', '.join(map(repr, names[:SHOWN]))}{more}")
+            texts.append(f"{word} {listed(list(map(repr, names)), SHOWN)}")
     return f"{of_others} {' and '.join(texts) or 'with the classes in another order'}"
 
 

@@ -21,7 +21,7 @@ from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.labels.ids import check_size, train_ids
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, listed
 from amvnet.files import atomic_write
 from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
@@ -201,10 +201,9 @@ def write_archive(
     names = sorted(rules.points)
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
-        others = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise InputError(
             f"{folder}: expected a prediction for each of {len(names)} scans, "
-            f"found no {missing[0]}{others}; predict these scans too, "
+            f"found no {listed(missing, 1)}; predict these scans too, "
             "or select predicted ones with --sequences or --split"
         )
     for name in names:

@@ -77,7 +77,9 @@ class Segmentation:
     def __repr__(self) -> str:
         parts = [f"<Segmentation of {len(self):,} points"]
         if self.origin is not None and len(self):
-            parts.append(f": {self._most_frequent()}")
+            shown = list(self.counts().items())[:SHOWN_CLASSES]
+            shares = [f"{count / len(self):.0%} {name}" for name, count in shown]
+            parts.append(f": {', '.join(shares)}")
         if self.verdict is not None:
             what = "uncertain" if self.has_two_networks else "mean entropy"
             parts.append(f"; {self.verdict.share:.1%} {what}")
@@ -85,11 +87,6 @@ class Segmentation:
                 parts.append(", not to be relied on")
 
         return "".join([*parts, ">"])
-
-    def _most_frequent(self) -> str:
-        """Return the most frequent classes and their shares, as text."""
-        shown = list(self.counts().items())[:SHOWN_CLASSES]
-        return ", ".join(f"{count / len(self):.0%} {name}" for name, count in shown)
 
     def counts(self) -> dict[str, int]:
         """Return the number of points of each class that occurs, by its name, most first."""
