@@ -22,7 +22,7 @@ from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
 from amvnet.weights.file import built_in
 
-from fixtures.commands import files, refusal, run_cli, succeed
+from fixtures.commands import files, refusal, refused, run_cli, succeed
 from fixtures.marks import with_quick
 from fixtures.tiny import GOLDEN
 
@@ -254,8 +254,7 @@ def test_evaluate_says_that_weights_without_head_have_no_amvnet(
     assert said in capsys.readouterr().out.replace("\n", " ")
     succeed(f"{command} --methods rv,bev")
     assert "not scored" not in capsys.readouterr().out
-    line = refusal(*command.split(), "--methods", "amvnet")
-    assert "no point_head" in line
+    refused((*command.split(), "--methods", "amvnet"), "no point_head")
 
 
 @pytest.fixture(scope="module")

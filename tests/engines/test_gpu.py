@@ -38,7 +38,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights, save
 
-from fixtures.commands import fails, files, refusal, run_cli
+from fixtures.commands import fails, files, refused, run_cli
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.engines import ScriptedEngine, sure_of
 from fixtures.networks import whole_model
@@ -529,8 +529,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
         pass
 
     for option, value in (("precision", "bfloat16"), ("tau", 0.1)):
-        error = refusal(*arguments, "--resume", f"--{option}", value)
-        assert option in error
+        refused((*arguments, "--resume", f"--{option}", value), option)
     assert run_cli(*arguments, "--resume", "--batch", 2) == (0, "")
     assert files(tmp_path) == names
 

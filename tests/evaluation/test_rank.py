@@ -29,7 +29,7 @@ from amvnet.evaluation.label_errors import (
 )
 from amvnet.weights.file import save
 
-from fixtures.commands import files, refusal, run_cli
+from fixtures.commands import files, refused, run_cli
 from fixtures.engines import giving, scripted
 from fixtures.tiny import fresh_weights, make_streets, without
 
@@ -250,8 +250,7 @@ def test_scans_without_labels_are_refused(world: Path, tmp_path: Path) -> None:
         shutil.rmtree(folder / "labels")
     options = ("--weights", world / "w.safetensors", "--out", tmp_path / "next.csv")
 
-    error = refusal("rank", tmp_path / "data", *options)
-    assert "labels" in error
+    refused(("rank", tmp_path / "data", *options), "labels")
 
 
 @pytest.mark.parametrize(
@@ -261,8 +260,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(
     world: Path, tmp_path: Path, weights: str, word: str
 ) -> None:
     options = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path / "next.csv")
-    error = refusal("rank", world / "data", *options)
-    assert word in error
+    refused(("rank", world / "data", *options), word)
     assert not files(tmp_path)
 
 

@@ -36,7 +36,7 @@ from amvnet.training.losses import rival_classes
 from amvnet.training.plan import Plan, open_for_training, sized_by_init, without_initial_weights
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.commands import refusal, run_cli, succeed
+from fixtures.commands import refusal, refused, run_cli, succeed
 from fixtures.own_scans import make_own_scans
 from fixtures.tiny import (
     BUILDING,
@@ -352,7 +352,7 @@ def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
 
 
 def test_a_fine_tuning_needs_weights(world: Path, tmp_path: Path) -> None:
-    assert "--init" in refusal(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}")
+    refused(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}", "--init")
 
 
 def test_all_sequences_of_another_dataset_are_mixed_in_if_it_has_no_split(tmp_path: Path) -> None:
