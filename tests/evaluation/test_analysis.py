@@ -63,12 +63,8 @@ def dataset(world: Path) -> Dataset:
     return open_dataset(f"semantickitti:{world / 'data'}")
 
 
-def with_assertion(weights: Weights, assertion: AssertionConfig) -> Weights:
-    return replace(weights, model=replace(weights.model, assertion=assertion))
-
-
 def with_tau(weights: Weights, tau: float) -> Weights:
-    return with_assertion(weights, AssertionConfig(tau))
+    return replace(weights, model=replace(weights.model, assertion=AssertionConfig(tau)))
 
 
 def analyze_08(dataset: Dataset, weights: Weights) -> Analysis:
@@ -89,13 +85,9 @@ def figures_of(dataset: Dataset, weights: Weights) -> tuple[float, dict[str, Any
     return float(np.concatenate(uncertain).mean()), metrics(matrix, dataset.taxonomy)
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
 def column(path: Path, name: str) -> list[str]:
-    return [row[name] for row in read_table(path)]
+    with path.open() as file:
+        return [row[name] for row in csv.DictReader(file)]
 
 
 # ---- counts
