@@ -35,7 +35,7 @@ from amvnet.scan import Scan
 from amvnet.weights.file import save
 from lidarstreets.layouts import write_whole
 
-from fixtures.commands import fails, refusal, run_cli
+from fixtures.commands import fails, refused, run_cli
 from fixtures.datasets import MAKERS, make_nuscenes
 from fixtures.examples import first_of, with_examples
 from fixtures.surroundings import LINKS, NAMES, PRECIOUS, REFUSED, contents_outside, surroundings
@@ -67,9 +67,7 @@ def some_cloud() -> Cloud:
 
 def named(name: str) -> InputScan:
     return FileScan(
-        NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud),
-        FileReader(None),
-        NUSCENES,
+        NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud), FileReader(None), NUSCENES
     )
 
 
@@ -238,8 +236,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("command", each_of(COMMANDS, "train"))
 def test_every_command_refuses_a_token_that_is_a_path(command: str, weights: Path) -> None:
     with surroundings(make=with_token("../../../victim/precious")) as base:
-        line = refusal(command.format(base=base, weights=weights))
-        assert "'../../../victim/precious'" in line
+        refused(command.format(base=base, weights=weights), "'../../../victim/precious'")
 
 
 HOSTILE = "../../../victim/precious"
@@ -325,14 +322,13 @@ def test_a_linked_folder_of_the_output_is_refused(command: str, weights: Path) -
             scores.parent.mkdir(parents=True, exist_ok=True)
             np.save(scores, np.ones((COUNT, 16)))
         line = command.replace("{base} ", "{base}/out/scores ")
-        error = refusal(f"{line.format(base=base, weights=weights)} --split mini_val")
-        assert "found a link" in error
+        refused(f"{line.format(base=base, weights=weights)} --split mini_val", "found a link")
 
 
 @pytest.mark.parametrize("link", ["sequences", "sequences/00", "sequences/00/velodyne"])
 def test_simulated_scans_are_not_written_through_a_link(link: str) -> None:
     with surroundings(link) as base:
-        assert "found a link" in refusal(f"simulate {base}/out --scans 1")
+        refused(f"simulate {base}/out --scans 1", "found a link")
 
 
 # ---- one file

@@ -6,7 +6,7 @@ import difflib
 import errno
 import re
 import reprlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -29,6 +29,12 @@ def shown(value: object) -> str:
     text.maxlevel = 2
     text.maxstring = text.maxother = 100
     return re.sub(r"\s*\n\s*", " ", text.repr(value))
+
+
+def listed(items: Sequence[str], limit: int) -> str:
+    """Return at most `limit` of some texts, separated by commas, and how many more there are."""
+    more = len(items) - limit
+    return ", ".join(items[:limit]) + (f" and {more} more" if more > 0 else "")
 
 
 def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") -> str:
@@ -60,16 +66,11 @@ class SomeBroken(Exception):
 
 @contextmanager
 def one_line_errors(
-    message: Callable[[BaseException], str],
-    only: tuple[type[Exception], ...] = (Exception,),
+    message: Callable[[BaseException], str], only: tuple[type[Exception], ...] = (Exception,)
 ) -> Iterator[None]:
-    """Turn exceptions that a library raises for bad input into an `InputError` of one line.
+    """Turn exceptions of some classes into an `InputError` of one line, which `message` returns.
 
-    An `InputError` passes unchanged, and so does an interruption by the user.
-
-    Args:
-        message: a function that returns the line for an exception.
-        only: the classes of exceptions to convert. Other exceptions pass unchanged.
+    An `InputError` passes unchanged, and so do other exceptions and an interruption by the user.
 
     Raises:
         InputError: if the block raises one of the exceptions to convert, or a library written in

@@ -185,7 +185,6 @@ def inside(folder: Path | str, name: Path | str) -> Path:
 
     Args:
         folder: the output folder, which may itself be a link.
-        name: the path of the file, relative to the folder.
 
     Raises:
         InputError: if the file would lie outside the folder because its name is absolute, has `..`

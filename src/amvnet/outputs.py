@@ -23,7 +23,6 @@ class Signature:
     """The beginning of all files of one kind.
 
     Attributes:
-        name: the name of the kind, for messages, such as "a page of view".
         beginning: a regular expression that matches the beginning of each such file.
         unit: a size in bytes. The size of each such file is a multiple of it.
     """
@@ -56,7 +55,6 @@ def check_outputs(
     Args:
         outputs: the files, each with the kind that it must have if it exists.
         inputs: files that the command reads. Entries that name no file are ignored.
-        overwrite: whether the user allows the command to replace files.
 
     Raises:
         InputError: if one of the files may not be written.

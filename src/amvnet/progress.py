@@ -28,11 +28,7 @@ class Tenths:
 
 
 def counted(count: int, noun: str, plural: str = "") -> str:
-    """Return a number of things in words, such as "1 scan" or "2 scans".
-
-    Args:
-        plural: the noun in the plural if it is irregular.
-    """
+    """Return a number of things in words, such as "2 scans"; irregular nouns give a `plural`."""
     return f"{count} {noun}" if count == 1 else f"{count} {plural or f'{noun}s'}"
 
 

@@ -120,8 +120,7 @@ class Scan:
 def at_origin(xyz: NDArray[np.floating]) -> NDArray[np.intp]:
     """Return the (M,) indices of the points at 0, 0, 0, given (N, 3 or more) coordinates."""
     on_axis = np.flatnonzero(xyz[:, 0] == 0)  # so few that the other coordinates take no time
-    indices: NDArray[np.intp] = on_axis[(xyz[on_axis, 1] == 0) & (xyz[on_axis, 2] == 0)]
-    return indices
+    return on_axis[(xyz[on_axis, 1] == 0) & (xyz[on_axis, 2] == 0)]
 
 
 def yaw_rotation(yaw: float) -> np.ndarray:
@@ -149,15 +148,14 @@ def check_scan(scan: Scan) -> Scan:
     return scan
 
 
-def check_trainable(scan: Scan) -> int:
-    """Return the number of valid points; raise InputError if no network can be trained on them."""
+def check_trainable(scan: Scan) -> None:
+    """Raise InputError if no network can be trained on a scan."""
     valid = int(scan.valid.sum())
     if valid < 2:  # batch norm needs two points to compute a variance
         raise InputError(
             f"{scan.name}: expected at least two valid points to train with, found {valid}; "
             "leave the scan out"
         )
-    return valid
 
 
 class TensorLike(Protocol):

@@ -22,7 +22,7 @@ from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
 from amvnet.weights.file import built_in
 
-from fixtures.commands import files, refusal, run_cli, succeed
+from fixtures.commands import files, refusal, refused, run_cli, succeed
 from fixtures.marks import with_quick
 from fixtures.tiny import GOLDEN
 
@@ -235,7 +235,6 @@ def test_scores_are_both_networks_probabilities_in_half_precision(
     with np.load(tmp_path / folder / "000000.npz", allow_pickle=False) as arrays:
         assert set(arrays.files) == {"rv", "bev"}
         for name, probabilities in (("rv", result.rv), ("bev", result.bev)):
-            assert probabilities is not None
             assert arrays[name].dtype == np.float16
             assert arrays[name].shape == (500, 19)
             assert np.array_equal(arrays[name], probabilities.astype(np.float16))
@@ -254,8 +253,7 @@ def test_evaluate_says_that_weights_without_head_have_no_amvnet(
     assert said in capsys.readouterr().out.replace("\n", " ")
     succeed(f"{command} --methods rv,bev")
     assert "not scored" not in capsys.readouterr().out
-    line = refusal(*command.split(), "--methods", "amvnet")
-    assert "no point_head" in line
+    refused((*command.split(), "--methods", "amvnet"), "no point_head")
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from amvnet.cli.parser import field_texts, make_parser, run_with
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
 from amvnet.config.schema import ModelConfig, Recipe
 
-from fixtures.commands import refusal, run_cli
+from fixtures.commands import refusal, refused, run_cli
 from fixtures.marks import with_full
 
 TRAIN = "train simulated-compact --data x --out o"
@@ -88,7 +88,7 @@ def test_a_file_whose_name_looks_like_an_option_is_told_how_to_be_given(
     assert line.endswith(f"found {name}; for the file of this name, give ./{name}\n")
 
     Path(name).unlink()
-    assert f"found {name}; " in refusal(f"predict {inputs} --weights sim-hdl64e --out o")
+    refused(f"predict {inputs} --weights sim-hdl64e --out o", f"found {name}; ")
 
 
 def test_values_that_begin_with_a_minus_need_no_equals_sign() -> None:
@@ -168,7 +168,7 @@ def test_an_empty_recipe_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "empty.yaml"
     for text in ("", "# nothing yet\n", "{}\n"):
         path.write_text(text)
-        assert "found an empty file" in refusal(f"train {path} --data x --out o")
+        refused(f"train {path} --data x --out o", "found an empty file")
 
 
 def test_an_error_of_the_disk_without_a_reason_says_what_is_known(

@@ -16,7 +16,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.plausible import following, neighbours
 
-from fixtures.commands import refusal, run_cli
+from fixtures.commands import refusal, refused, run_cli
 from fixtures.datasets import MAKERS
 from fixtures.examples import first_of
 from fixtures.scan_writers import some_points
@@ -328,18 +328,15 @@ def test_lost_returns_are_not_counted_as_labelled(data: Path) -> None:
 @pytest.mark.parametrize("height", [float("nan"), -1.0])
 def test_an_impossible_sensor_is_refused(data: Path, height: float) -> None:
     describe(data.parent, sensor={"height": height})
-    error = refusal("check", data)
-    assert "sensor: height: expected metres from 0 to 100" in error
+    refused(("check", data), "sensor: height: expected metres from 0 to 100")
 
 
 def test_labels_of_one_folder_are_counted_before_it_is_refused(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     describe(data.parent, scans="a/*.npy")
-    error = refusal("check", data)
-    assert "two sequences" in error
+    refused(("check", data), "two sequences")
     assert f"{2 * np.count_nonzero(RAW == 3)}" in capsys.readouterr().out
 
     write_labels(data.parent / "a/0.label", np.full(60, 55))
-    error = refusal("check", data)
-    assert "55 (60 points in 1 scan" in error
+    refused(("check", data), "55 (60 points in 1 scan")

@@ -109,9 +109,7 @@ def test_predict_writes_the_ids_of_the_map_for_datasets_and_files(tmp_path: Path
     assert "expected coarse, lidog or a YAML file" in message
 
 
-def test_weights_of_one_benchmark_are_scored_on_the_other_by_coarse_classes(
-    tmp_path: Path,
-) -> None:
+def test_weights_of_one_benchmark_are_scored_on_the_other_by_coarse_classes(tmp_path: Path) -> None:
     # Rows by elevation, as the weights of KITTI have them.
     weights = save(fresh_weights(), tmp_path / "w.safetensors")
     figures = tmp_path / "figures.json"

@@ -456,10 +456,7 @@ def test_an_mcap_file_without_messages_of_ros_2_is_refused(tmp_path: Path) -> No
         strings = len(profile).to_bytes(4, "little") + profile + bytes(4)
         header = b"\x01" + len(strings).to_bytes(8, "little") + strings
         path.write_bytes(b"\x89MCAP0\r\n" + header + bytes(100))
-        fails(
-            lambda: Bag(path, ".mcap"),
-            "Profile is not ros2",
-        )
+        fails(lambda: Bag(path, ".mcap"), "Profile is not ros2")
 
 
 def test_the_offset_that_the_error_for_map_coordinates_names_helps(tmp_path: Path) -> None:
@@ -562,7 +559,6 @@ def test_a_dimension_of_las_with_rings_is_read(tmp_path: Path) -> None:
     las.write(str(tmp_path / "a.las"))
 
     ring = read_cloud(tmp_path / "a.las").ring
-    assert ring is not None
     assert ring.tolist() == list(np.arange(60) % 16)
 
 

@@ -121,12 +121,7 @@ def test_scans_without_a_label_file_are_left_out_of_the_training(tmp_path: Path)
 
     # Without labels, b does not validate: a is left alone.
     (tmp_path / "b/1.label").unlink()
-    fails(
-        lambda: to_train(data_of(tmp_path)),
-        "two sequences",
-        "a alone",
-        "under split",
-    )
+    fails(lambda: to_train(data_of(tmp_path)), "two sequences", "a alone", "under split")
     first = tmp_path / "b/0.label"  # that was looked for
     fails(lambda: to_train(data_of(tmp_path), None, ["b"]), "labelled scans", first, "other 2")
 
@@ -220,9 +215,7 @@ def test_test_scans_are_never_trained_on(tmp_path: Path) -> None:
     assert "b" not in {record.sequence for record in to_mix_in(data).train}
 
 
-def test_the_default_split_validates_with_the_last_sequence_that_has_labels(
-    tmp_path: Path,
-) -> None:
+def test_the_default_split_validates_with_the_last_sequence_that_has_labels(tmp_path: Path) -> None:
     assert sequences_of(sites(tmp_path, labelled="abc")) == ({"a", "b"}, {"c"})
 
 

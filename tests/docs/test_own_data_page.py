@@ -23,10 +23,6 @@ PAGE = DocsPage("docs/own_data.md")
 ONE_EPOCH = {"rv": {"epochs": 1}, "bev": {"epochs": 1}, "head": {"epochs": 1}}
 
 
-def without_comments(text: str) -> str:
-    return re.sub(r"\s*#.*", "", text)
-
-
 @pytest.mark.full
 def test_every_command_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -49,7 +45,7 @@ def test_every_command_of_the_page_runs(
     run(PAGE.commands, changes)
 
     (block,) = [block for block in PAGE.blocks("yaml") if "ignored: [-1]" in block]
-    assert without_comments(block) == Path("robot/robot.yaml").read_text()
+    assert re.sub(r"\s*#.*", "", block) == Path("robot/robot.yaml").read_text()
     for name in ("robot", "new"):
         weights = load(f"runs/{name}")
         assert weights.taxonomy.classes == tuple(CLASSES)

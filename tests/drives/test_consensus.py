@@ -8,7 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amvnet.drives.consensus import LEAST, OWN, Consensus, DriveScan, VoxelTable, index_of, keys_of
+from amvnet.drives.consensus import (
+    LEAST,
+    OWN,
+    SIZE,
+    Consensus,
+    DriveScan,
+    VoxelTable,
+    index_of,
+    keys_of,
+)
 
 CLASSES = 8
 STEP = 1 / 16  # log scores and weights are whole numbers of these steps
@@ -50,7 +59,7 @@ def expected(drive: Sequence[DriveScan[int]], consensus: Consensus) -> Iterator[
                     logs = np.log(np.maximum(scores, LEAST))
                     weight = max(np.round(scores.max() ** 2 / STEP), 1) * STEP
                     vote = (weight, np.round(logs / STEP) * STEP)
-                    for size in (consensus.size, 2 * consensus.size):
+                    for size in (SIZE, 2 * SIZE):
                         votes.setdefault((size, voxel_of(scan, point, size)), []).append(vote)
 
         fused = np.zeros((len(drive[current].xyz), CLASSES))
@@ -58,7 +67,7 @@ def expected(drive: Sequence[DriveScan[int]], consensus: Consensus) -> Iterator[
             if not scores.any():
                 continue
             logs = OWN * np.log(np.maximum(scores, LEAST))
-            for size in (consensus.size, 2 * consensus.size):
+            for size in (SIZE, 2 * SIZE):
                 of_voxel = votes[size, voxel_of(drive[current], point, size)]
                 total = sum(weight for weight, _ in of_voxel)
                 mean = sum(weight * values for weight, values in of_voxel) / total

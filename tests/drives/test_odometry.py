@@ -30,10 +30,7 @@ def moved_back(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
     return np.asarray((points - motion[:3, 3]) @ motion[:3, :3])
 
 
-@pytest.mark.parametrize(
-    ("factor", "words"),
-    [(1.25, "0.8 times"), (0.8, "1.25 times")],
-)
+@pytest.mark.parametrize(("factor", "words"), [(1.25, "0.8 times"), (0.8, "1.25 times")])
 @pytest.mark.parametrize("motion", [{"metres": 4.0}, {"degrees": 20.0}])
 def test_the_message_names_the_motion_that_fits_better(
     factor: float, words: str, motion: dict[str, float]

@@ -18,7 +18,7 @@ from amvnet.errors import InputError
 from amvnet.inference import map as mapping
 from amvnet.weights.file import save
 
-from fixtures.commands import fails, refusal, run_cli, succeed
+from fixtures.commands import fails, refused, run_cli, succeed
 from fixtures.drives import SCANS, drive_poses, write_drive
 from fixtures.tiny import fresh_weights
 
@@ -163,10 +163,10 @@ def test_the_viewer_and_the_readers_take_a_map(world: Path, tmp_path: Path) -> N
 def test_a_map_replaces_maps_only(world: Path, tmp_path: Path) -> None:
     out = tmp_path / "map.ply"
     out.write_text("ply\nmy own points")
-    assert "--overwrite" in refusal(command(world, out))
-    assert "a map" in refusal(command(world, out, "--overwrite"))
+    refused(command(world, out), "--overwrite")
+    refused(command(world, out, "--overwrite"), "a map")
     assert out.read_text() == "ply\nmy own points"
-    assert ".laz" in refusal(command(world, tmp_path / "map.txt"))
+    refused(command(world, tmp_path / "map.txt"), ".laz")
 
     succeed(command(world, tmp_path / "other.ply"))
     assert run_cli(*command(world, tmp_path / "other.ply", "--overwrite").split())[0] == 0
@@ -178,7 +178,7 @@ def test_a_map_replaces_no_scan_and_no_other_cloud(world: Path, tmp_path: Path) 
     out = tmp_path / "other.laz"
     laspy.LasData(laspy.LasHeader(point_format=0)).write(out)
     content = out.read_bytes()
-    assert "a map in LAZ" in refusal(command(world, out, "--overwrite"))
+    refused(command(world, out, "--overwrite"), "a map in LAZ")
     assert out.read_bytes() == content
 
     drive = tmp_path / "drive"
@@ -186,7 +186,7 @@ def test_a_map_replaces_no_scan_and_no_other_cloud(world: Path, tmp_path: Path) 
         succeed(command(world, drive / name))
     scan = (drive / "a.laz").read_bytes()
     words = f"--weights {world}/w.safetensors --out {drive}/a.laz --overwrite"
-    assert "an input" in refusal(f"map {drive} {words}")
+    refused(f"map {drive} {words}", "an input")
     assert (drive / "a.laz").read_bytes() == scan
     succeed(command(world, tmp_path / "map.laz"))
     succeed(command(world, tmp_path / "map.laz", "--overwrite"))
@@ -212,7 +212,7 @@ def test_a_map_that_was_stopped_is_resumed_to_the_same_map(
     assert run_cli(*command(world, out).split())[0] != 0
     assert not out.exists()
     for other in ("--voxel 0.7", "--height 1.5", "--columns x,y,z,intensity"):
-        assert "another one" in refusal(command(world, out, f"--resume {other}"))
+        refused(command(world, out, f"--resume {other}"), "another one")
     succeed(command(world, out, "--resume"))
     assert added == 4 + SCANS - 2
     assert out.read_bytes() == (tmp_path / "whole.ply").read_bytes()
@@ -235,5 +235,5 @@ def test_a_map_is_of_one_drive(world: Path, tmp_path: Path) -> None:
     for sequence in ("01", "02"):
         write_drive(tmp_path / "data", sequence, 3)
     line = f"map {tmp_path}/data --weights {world}/w.safetensors --out {tmp_path}/map.ply"
-    assert "2 recordings" in refusal(line)
+    refused(line, "2 recordings")
     succeed(f"{line} --sequences 02")

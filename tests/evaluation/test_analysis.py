@@ -30,7 +30,7 @@ from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.commands import files, refusal, succeed
+from fixtures.commands import files, refused, succeed
 from fixtures.tiny import (
     fresh_weights,
     make_streets,
@@ -63,12 +63,8 @@ def dataset(world: Path) -> Dataset:
     return open_dataset(f"semantickitti:{world / 'data'}")
 
 
-def with_assertion(weights: Weights, assertion: AssertionConfig) -> Weights:
-    return replace(weights, model=replace(weights.model, assertion=assertion))
-
-
 def with_tau(weights: Weights, tau: float) -> Weights:
-    return with_assertion(weights, AssertionConfig(tau))
+    return replace(weights, model=replace(weights.model, assertion=AssertionConfig(tau)))
 
 
 def analyze_08(dataset: Dataset, weights: Weights) -> Analysis:
@@ -89,13 +85,9 @@ def figures_of(dataset: Dataset, weights: Weights) -> tuple[float, dict[str, Any
     return float(np.concatenate(uncertain).mean()), metrics(matrix, dataset.taxonomy)
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
 def column(path: Path, name: str) -> list[str]:
-    return [row[name] for row in read_table(path)]
+    with path.open() as file:
+        return [row[name] for row in csv.DictReader(file)]
 
 
 # ---- counts
@@ -230,9 +222,7 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path, tmp_path
     assert five_last.stat().st_mtime_ns == five_time
 
     other = save(fresh_weights(seed=1), tmp_path / "other.safetensors")
-    assert "networks" in refusal(
-        f"{command} --overwrite".replace(f"{world}/w.safetensors", str(other))
-    )
+    refused(f"{command} --overwrite".replace(f"{world}/w.safetensors", str(other)), "networks")
 
 
 @pytest.mark.full
@@ -267,7 +257,7 @@ def test_wrong_input_of_analyze_is_one_line(world: Path, tmp_path: Path) -> None
     ]
     for name, options, word in cases:
         arguments = f"--weights {world}/{name}.safetensors --out {tmp_path}/none {options}"
-        assert word in refusal(f"analyze {world}/data {arguments}")
+        refused(f"analyze {world}/data {arguments}", word)
     assert not files(tmp_path)
 
 
@@ -330,6 +320,6 @@ def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(
     assert (out / "ablation.csv").read_text() == text
 
     other = make_streets(tmp_path / "data", ("02", "03", "08"))
-    assert "scans" in refusal(command.replace(f"{world}/data", str(other)))
+    refused(command.replace(f"{world}/data", str(other)), "scans")
     for path, end in ends.items():
         assert path.read_bytes()[-1000:] == end

@@ -29,11 +29,7 @@ def submit(spec: str, *options: object) -> tuple[int, str]:
 
 
 def without_sources(entries: Entries) -> Entries:
-    rest = {}
-    for name, content in entries.items():
-        if not name.endswith(("/", ".json")):
-            rest[name] = content
-    return rest
+    return {name: content for name, content in entries.items() if not name.endswith(("/", ".json"))}
 
 
 def test_a_packed_archive_keeps_to_the_official_rules(case: Case, tmp_path: Path) -> None:

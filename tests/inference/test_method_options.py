@@ -13,7 +13,7 @@ import amvnet
 from amvnet.config.schema import AssertionConfig
 from amvnet.weights.file import save
 
-from fixtures.commands import refusal, succeed
+from fixtures.commands import refused, succeed
 from fixtures.tiny import fresh_weights, make_streets
 
 FRESH = fresh_weights()
@@ -53,7 +53,7 @@ def test_evaluate_says_which_tau_was_chosen(world: Path) -> None:
 
 
 def test_predictions_have_no_tau(world: Path) -> None:
-    assert "--tau" in refusal(f"evaluate {world} --predictions {world} --tau 0.5")
+    refused(f"evaluate {world} --predictions {world} --tau 0.5", "--tau")
 
 
 @pytest.mark.parametrize("method", ["rv-knn", "amvnet"])
@@ -72,4 +72,4 @@ def test_predict_writes_the_labels_of_the_segmenter(world: Path, method: str) ->
 
 def test_the_vote_has_no_uncertain_points_to_write(world: Path, tmp_path: Path) -> None:
     command = f"predict semantickitti:{world} --weights {world}/w.safetensors --method rv-knn"
-    assert "two networks" in refusal(f"{command} --uncertain --out {tmp_path}")
+    refused(f"{command} --uncertain --out {tmp_path}", "two networks")

@@ -35,7 +35,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
-from fixtures.commands import fails, files, refusal, run_cli, succeed
+from fixtures.commands import fails, files, refused, run_cli, succeed
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.datasets import MAKERS
 from fixtures.marks import with_full
@@ -116,8 +116,7 @@ def test_only_broken_scans_are_one_line(world: Path, tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(b"123")
     (tmp_path / "b.bin").write_bytes(b"123")
     inputs = f"{tmp_path}/a.bin {tmp_path}/b.bin"
-    line = refusal(f"predict {inputs} --weights {world}/{WEIGHTS} --out {tmp_path}/out")
-    assert "a.bin" in line
+    refused(f"predict {inputs} --weights {world}/{WEIGHTS} --out {tmp_path}/out", "a.bin")
     assert not files(tmp_path / "out")
 
 
@@ -171,7 +170,7 @@ def test_a_command_without_memory_ends_with_one_line(
         raise error
 
     monkeypatch.setattr(TorchEngine, "__init__", fail)
-    assert "memory" in refusal(predict(world, tmp_path))
+    refused(predict(world, tmp_path), "memory")
     monkeypatch.setattr(TorchEngine, "__init__", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run_cli(*predict(world, tmp_path).split())
@@ -258,12 +257,11 @@ def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_p
         ("--scores", "scores"),
         (f"--weights {other}", "weights"),
     ):
-        line = refusal(predict(world, out, f"--resume {options}"))
-        assert f"other values of {key};" in line
+        refused(predict(world, out, f"--resume {options}"), f"other values of {key};")
     check_same(out, whole)
 
     (out / JOURNAL).rename(out / UNFINISHED)
-    assert "other values of method;" in refusal(predict(world, out, "--resume --method rv"))
+    refused(predict(world, out, "--resume --method rv"), "other values of method;")
 
     succeed(predict(world, out, "--method rv --overwrite"))
     assert files(out) == files(whole)
@@ -408,7 +406,7 @@ def test_the_folder_of_another_run_takes_other_scans_only_if_told_so(
 
     other = f"predict {world}/scans/000001.bin {command}"
     before = files(tmp_path)
-    assert "1 scan of an earlier run" in refusal(other)
+    refused(other, "1 scan of an earlier run")
     assert files(tmp_path) == before
     succeed(f"{other} --resume")
     succeed(f"predict {world}/scans/000002.bin {command} --overwrite --method rv")
@@ -438,8 +436,6 @@ def test_the_end_counts_the_classes_of_the_label_files_and_names_commands_that_r
 
     view = re.search(r"^look at them: amvnet (.*)$", printed, re.M)
     train = re.search(r"^train on your labels.*: amvnet (train .*)$", printed, re.M)
-    assert view is not None
-    assert train is not None
     assert run_cli(*shlex.split(view[1]))[0] == 0
     assert "--data YOURS.yaml" in train[1]
 
@@ -513,7 +509,7 @@ def test_a_folder_belongs_to_one_run_at_a_time(world: Path, tmp_path: Path) -> N
     pytest.importorskip("fcntl")
     with running("-c", HOLD, tmp_path) as first:
         before = files(tmp_path)
-        assert "another run" in refusal(predict(world, tmp_path))
+        refused(predict(world, tmp_path), "another run")
         assert files(tmp_path) == before
         first.kill()
 
@@ -532,7 +528,7 @@ def test_a_run_replaces_no_labels_of_a_run_that_ended_while_it_loaded_its_networ
         return load(*arguments)
 
     monkeypatch.setattr("amvnet.cli.commands.predict.load_segmenter", load_slowly)
-    assert "expected no file" in refusal(predict(world, tmp_path))
+    refused(predict(world, tmp_path), "expected no file")
     (settings,) = read_journals(tmp_path).settings
     assert settings["method"] == "rv"
 

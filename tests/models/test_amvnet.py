@@ -234,9 +234,7 @@ def cosine(a: list[float], b: list[float]) -> float:
 
 def test_disagreement_equals_a_loop_of_its_formula() -> None:
     f, g, points, _ = random_scores()
-    expected = []
-    for i in range(len(f)):
-        expected.append(cosine(f[i].tolist(), g[i].tolist()) <= 0.7)
+    expected = [cosine(f[i].tolist(), g[i].tolist()) <= 0.7 for i in range(len(f))]
 
     assert Disagreement(0.7)(f, g, points).tolist() == expected
     assert set(expected) == {False, True}

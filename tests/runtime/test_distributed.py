@@ -149,17 +149,12 @@ def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("stage", "launcher"),
-    [("rv", "launch"), ("bev", "torchrun"), ("head", "srun"), ("rv", "srun")],
+    ("stage", "launcher"), [("rv", "launch"), ("bev", "torchrun"), ("head", "srun"), ("rv", "srun")]
 )
 def test_two_processes_train_the_weights_of_one(
     world: Path, tmp_path: Path, stage: str, launcher: str
 ) -> None:
-    launchers = {
-        "launch": output_of_launch,
-        "torchrun": output_of_torchrun,
-        "srun": output_of_srun,
-    }
+    launchers = {"launch": output_of_launch, "torchrun": output_of_torchrun, "srun": output_of_srun}
     printed = launchers[launcher](tmp_path, *train_arguments(world, tmp_path / "two", stage))
     assert printed.count("epoch 2/") == 1  # only one of them prints
 

@@ -185,9 +185,6 @@ def test_the_later_stages_are_those_that_are_not_finished(
     )
     stage: Any = SimpleNamespace(name="rv")
     plan: Any = SimpleNamespace(
-        stages=("rv", "bev", "head"),
-        recipe=Recipe(training=training),
-        resume=resume,
-        out=tmp_path,
+        stages=("rv", "bev", "head"), recipe=Recipe(training=training), resume=resume, out=tmp_path
     )
     assert _epochs_after(stage, plan) == later

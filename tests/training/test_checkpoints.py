@@ -20,7 +20,7 @@ from amvnet.files import alone_in
 from amvnet.scan import Scan
 from amvnet.training.stage import WholeCheckpoints
 
-from fixtures.commands import files, refusal, run_cli
+from fixtures.commands import files, refused, run_cli
 from fixtures.tiny import make_streets, write_recipe
 
 
@@ -74,7 +74,7 @@ def test_a_stage_is_trained_by_one_call_at_a_time(world: Path, tmp_path: Path, s
     with alone_in(out, ".rv.lock"):
         before = {name: (out / name).read_bytes() for name in files(out)}
         words = f"--stage {stage} --resume --training.seed 2 --training.bev.epochs 1"
-        assert "another run" in refusal(f"{command(world, out)} {words}")
+        refused(f"{command(world, out)} {words}", "another run")
         assert {name: (out / name).read_bytes() for name in files(out)} == before
         assert run_cli(*command(world, out).split(), "--stage", "bev", "--resume") == (0, "")
     assert run_cli(*command(world, out).split(), "--resume") == (0, "")
@@ -85,7 +85,7 @@ def test_a_run_does_not_write_into_a_dataset(world: Path, tmp_path: Path) -> Non
     shutil.copytree(world / "data", tmp_path / "data")
     before = files(tmp_path)
     train = f"train {world}/recipe.yaml --data {world}/data --out {tmp_path}/data"
-    assert f"{tmp_path}/data: expected a new folder" in refusal(train)
+    refused(train, f"{tmp_path}/data: expected a new folder")
     assert files(tmp_path) == before
 
 
@@ -103,16 +103,14 @@ def test_a_killed_process_that_reads_scans_is_one_line(
     monkeypatch.setattr(SemanticKitti, "read", read_or_die)
     options = "--stage rv --training.workers 1"
     train = f"train {world}/recipe.yaml --data {world}/data --out {tmp_path}/run {options}"
-    line = refusal(train)
-    assert "training.workers" in line
-    assert "killed" in line
+    refused(train, "training.workers", "killed")
 
 
 def test_a_run_that_cannot_begin_leaves_no_folder(world: Path, tmp_path: Path) -> None:
     shutil.copytree(world / "data", tmp_path / "data")
     (tmp_path / "data/sequences/00/labels/000000.label").write_bytes(b"1234")
     train = f"train {world}/recipe.yaml --data {tmp_path}/data --out {tmp_path}/run"
-    assert "000000.label" in refusal(train)
+    refused(train, "000000.label")
     assert not (tmp_path / "run").exists()
 
 

@@ -36,7 +36,7 @@ from amvnet.training.losses import rival_classes
 from amvnet.training.plan import Plan, open_for_training, sized_by_init, without_initial_weights
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.commands import refusal, run_cli, succeed
+from fixtures.commands import refusal, refused, run_cli, succeed
 from fixtures.own_scans import make_own_scans
 from fixtures.tiny import (
     BUILDING,
@@ -228,7 +228,6 @@ def test_ones_own_scans_are_brought_to_the_initial_weights_rather_than_to_earlie
         dataset = open_for_training(str(own_file), recipe, tmp_path / "run", init)
         assert isinstance(dataset, OwnScans)
         assert isinstance(dataset.normalise, Normaliser)
-        assert dataset.normalise.expected is not None
         return dataset.normalise.expected.sensor.height
 
     save(by_height[1.0], tmp_path / "run/weights.safetensors")
@@ -247,7 +246,6 @@ def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) ->
 
     both = PointBatch.of([mix(a, b, np.random.default_rng(0))])
     view = RangeView(fresh_weights().model.range_view)
-    assert both.row is not None
     known = both.row >= 0
     assert 0 < known.sum() < len(known)
     assert torch.equal(view.rows(both)[known], both.row[known])
@@ -352,7 +350,7 @@ def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
 
 
 def test_a_fine_tuning_needs_weights(world: Path, tmp_path: Path) -> None:
-    assert "--init" in refusal(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}")
+    refused(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}", "--init")
 
 
 def test_all_sequences_of_another_dataset_are_mixed_in_if_it_has_no_split(tmp_path: Path) -> None:

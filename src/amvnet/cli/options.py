@@ -11,7 +11,7 @@ from amvnet.cli.console import report, silence
 from amvnet.cli.parser import flag_of
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
-from amvnet.errors import InputError
+from amvnet.errors import InputError, listed
 from amvnet.models.methods import MethodName
 from amvnet.progress import counted
 
@@ -142,11 +142,7 @@ class TrainingChoice:
 
 
 def report_unused(source: Source, title: str = "") -> None:
-    """Report the scans of a dataset that a training does not use.
-
-    Args:
-        title: the beginning of each line.
-    """
+    """Report the scans that a training does not use, in lines that begin with `title`."""
     if source.unlabelled:
         report(f"{title}skipped for lack of labels: {describe_records(source.unlabelled)}")
     _report_unnamed(source, title)
@@ -220,12 +216,6 @@ class LabelChoice:
         self, weights: Weights, choice: ScanChoice, sensor_choice: SensorChoice, compute: Compute
     ) -> LabellingRequest:
         """Return the request for labels by some weights.
-
-        Args:
-            weights: the weights.
-            choice: which scans to read, and how files hold them.
-            sensor_choice: what is known about the sensor.
-            compute: where and how the networks are computed.
 
         Raises:
             InputError: if a value cannot be parsed, or does not fit the weights.
@@ -361,8 +351,4 @@ def describe_records(records: Sequence[ScanRecord]) -> str:
     if not records:
         return "none"
     names = sorted({record.sequence for record in records})
-    text = ", ".join(names[:MAX_SEQUENCES])
-    if len(names) > MAX_SEQUENCES:
-        text += f" and {len(names) - MAX_SEQUENCES} more"
-
-    return f"{counted(len(records), 'scan')} of {text}"
+    return f"{counted(len(records), 'scan')} of {listed(names, MAX_SEQUENCES)}"

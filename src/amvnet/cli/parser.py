@@ -186,7 +186,7 @@ def make_parser(command: str, run: Callable[..., None]) -> Parser:
             metavars.append(METAVARS.get(name, name.upper()))
             parser.kinds[name] = kind
             _add_argument(parser, name, kind, metavars[-1], texts[name])
-        elif _is_bundle(kind):
+        elif isinstance(kind, type) and dataclasses.is_dataclass(kind):
             group = parser.add_argument_group(first_line(kind))
             kinds = get_type_hints(kind, include_extras=True)
             field_docs = field_texts(kind)
@@ -215,10 +215,6 @@ def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
             own = {field.name: values[field.name] for field in dataclasses.fields(kind)}
             arguments.append(kind(**own))
     run(*arguments)
-
-
-def _is_bundle(kind: Any) -> bool:
-    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
 
 
 def _add_argument(parser: Parser, name: str, kind: Any, metavar: str, text: str) -> None:

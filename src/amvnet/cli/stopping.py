@@ -15,10 +15,9 @@ from amvnet.files import unfinished
 
 
 class Stop:
-    """A request to stop, which a signal may make.
+    """A request to stop, which a signal may make; `line` is printed when the command has stopped.
 
     Args:
-        line: the line to print when the command has stopped.
         exits: whether this process belongs to the command line, and so ends with the command.
 
     Attributes:

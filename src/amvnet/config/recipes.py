@@ -17,11 +17,8 @@ _FOLDER = resources.files("amvnet.config") / "recipes"
 
 def recipe_names() -> tuple[str, ...]:
     """Return the names of the built-in recipes, sorted."""
-    names = []
-    for file in _FOLDER.iterdir():
-        if file.name.endswith(".yaml"):
-            names.append(file.name.removesuffix(".yaml"))
-    return tuple(sorted(names))
+    names = (file.name for file in _FOLDER.iterdir())
+    return tuple(sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml")))
 
 
 def load_recipe(name_or_path: str) -> Recipe:

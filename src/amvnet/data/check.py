@@ -23,7 +23,7 @@ from amvnet.data.plausible import (
     scattered_classes,
 )
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, listed
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import check_trainable
@@ -53,13 +53,7 @@ class Contents:
 
 @dataclass
 class UnknownId:
-    """The occurrences of a raw id that is neither in a class nor ignored.
-
-    Attributes:
-        points: the number of points with this id.
-        scans: the number of scans with such a point.
-        example: a file with such a point.
-    """
+    """How often a raw id occurs that is neither in a class nor ignored, and a file with it."""
 
     points: int = 0
     scans: int = 0
@@ -75,11 +69,8 @@ class SplitReport:
         scans_with: (K + 1,) the number of scans with a point of each train id.
         scans: the names of the labelled scans that could be read.
         unlabelled: the names of the scans without a label file, which are skipped.
-        broken: the messages about broken scans, by the name of the scan.
-        unknown: how often each unknown raw id occurs.
         neighbours, raised: the sums of those in `Contents`.
         stray: the names of the scans whose labels do not follow the geometry.
-        names: the name of a scan by its digest.
     """
 
     points: np.ndarray
@@ -122,9 +113,6 @@ class Report:
     """The contents of the labelled scans of a dataset, by split.
 
     Attributes:
-        spec: the text by which `open_dataset` opens the dataset.
-        taxonomy: the classes of the dataset.
-        splits: the report of each split, by the name of the split.
         contents: what each scan holds, by the name of the scan; broken scans are left out.
     """
 
@@ -168,11 +156,10 @@ class Report:
             )
         unknown = self.unknown
         if unknown:
-            texts = [describe_unknown(*item) for item in list(unknown.items())[:SHOWN_IDS]]
-            more = f" and {len(unknown) - SHOWN_IDS} more" if len(unknown) > SHOWN_IDS else ""
+            texts = [describe_unknown(*item) for item in unknown.items()]
             yield (
                 f"{self.spec}: expected ids of classes or of ignored points, found "
-                f"{', '.join(texts)}{more}; {_advice(self.taxonomy)}"
+                f"{listed(texts, SHOWN_IDS)}; {_advice(self.taxonomy)}"
             )
             return
 
@@ -268,9 +255,7 @@ def check_scans(
     progress: Progress = no_progress,
     processes: Processes = ALONE,
 ) -> Report:
-    """Read all labelled scans of some splits, and report what they hold.
-
-    Several threads read the scans.
+    """Read all labelled scans of some splits by several threads, and report what they hold.
 
     Args:
         splits: the scans by the name of the split; scans without labels are only counted.

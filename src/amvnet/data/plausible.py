@@ -47,9 +47,6 @@ def neighbours(xyz: np.ndarray, labels: np.ndarray, size: int) -> np.ndarray:
 def following(counts: np.ndarray) -> np.ndarray:
     """Return the shares of neighbours with the same label beyond what chance gives, at most 1.
 
-    Args:
-        counts: (2, K + 1) counts of `neighbours`.
-
     Returns:
         (K + 2,) the share of each train id, and last the share of all points; random labels have
         about 0, and NaN says that too few points have neighbours.
@@ -81,8 +78,7 @@ def raised(xyz: np.ndarray, labels: np.ndarray, is_ground: np.ndarray) -> np.nda
         level = max((np.roll(xyz, turn, axis=1) for turn in range(3)), key=_area)
         both = (ground & (_over_lowest(points) > RAISED) for points in (level, -level))
         is_raised = min(both, key=np.sum)
-    counts: np.ndarray = np.bincount(labels[is_raised], minlength=len(is_ground))
-    return counts
+    return np.bincount(labels[is_raised], minlength=len(is_ground))
 
 
 def _area(xyz: np.ndarray) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amvnet.config.bounds import check_text
-from amvnet.errors import InputError, one_line_errors, shown
+from amvnet.errors import InputError, listed, one_line_errors, shown
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
@@ -139,21 +139,17 @@ class Taxonomy:
 
         unknown = np.unique(raw_ids[train_ids == UNKNOWN]).tolist()
         if unknown:
-            listed = ", ".join(map(str, unknown[:SHOWN]))
-            if len(unknown) > SHOWN:
-                listed += f" and {len(unknown) - SHOWN} more"
-
+            found = listed(list(map(str, unknown)), SHOWN)
             if raw_ids.max() <= self.size:
-                listed += " (train ids, it seems)"
+                found += " (train ids, it seems)"
             usual = "write its raw ids, or describe your own in a YAML file (docs/own_data.md)"
             if self.name not in TAXONOMIES:
                 usual = "add them to a class or to ignored, or write ignored: rest"
             raise InputError(
                 f"expected the raw ids of {self.name} "
-                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; {advice or usual}"
+                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {found}; {advice or usual}"
             )
-        checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
-        return checked
+        return train_ids.astype(np.uint8)
 
     def to_raw(self, ids: NDArray[np.integer]) -> NDArray[np.uint32]:
         """Return the raw ids (N,) uint32 of train ids (N,); raise InputError if one is wrong."""
@@ -164,8 +160,7 @@ class Taxonomy:
                 f"found {ids.min()}..{ids.max()}; give train ids of this taxonomy"
             )
 
-        raw_ids: NDArray[np.uint32] = np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
-        return raw_ids
+        return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON.
@@ -218,8 +213,7 @@ def describe_difference(classes: Sequence[str], others: Sequence[str], of_others
     texts = []
     for names, word in ((missing, "without"), (added, "with")):
         if names:
-            more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-            texts.append(f"{word} {', '.join(map(repr, names[:SHOWN]))}{more}")
+            texts.append(f"{word} {listed(list(map(repr, names)), SHOWN)}")
     return f"{of_others} {' and '.join(texts) or 'with the classes in another order'}"
 
 
@@ -301,16 +295,13 @@ def _built_in() -> dict[str, Taxonomy]:
     taxonomies = {}
     for name, table in tomllib.loads(text).items():
         entries = table["classes"].values()
-        raw_to_train = []
-        for train_id, entry in enumerate(entries):
-            for raw in entry["raw"]:
-                raw_to_train.append((raw, train_id))
-
         fields = {
             "name": name,
             "classes": list(table["classes"])[1:],
             "colors": map(itemgetter("color"), entries),
-            "raw_to_train": raw_to_train,
+            "raw_to_train": [
+                (raw, ids) for ids, entry in enumerate(entries) for raw in entry["raw"]
+            ],
             "train_to_raw": map(itemgetter("id"), entries),
         }
         taxonomies[name] = Taxonomy.from_dict({**table, **fields})

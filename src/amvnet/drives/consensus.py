@@ -25,11 +25,7 @@ Item = TypeVar("Item")
 
 
 class VoxelTable:
-    """The sums over some scans by voxel. It grows with the voxels that these scans see.
-
-    Args:
-        width: C, the number of sums in a voxel.
-    """
+    """The sums over some scans by voxel, C (`width`) in each; it grows with the voxels they see."""
 
     def __init__(self, width: int) -> None:
         self._keys = np.empty(0, np.int64)  # of all voxels in reach, ascending
@@ -70,16 +66,13 @@ class VoxelTable:
     def means(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return the (M, C - 1) weighted means; the last sum of a voxel is its total weight."""
         sums = self._sums[self.rows(keys)]
-        means: NDArray[np.float32] = sums[:, :-1] / sums[:, -1:]
-        return means
+        return sums[:, :-1] / sums[:, -1:]
 
     def scans(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the number of scans (M,) that see each voxel."""
         return self._scans[self.rows(keys)]
 
-    def contents(
-        self,
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
+    def contents(self) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
         """Return all voxels: their keys (V,), sums (V, C) and numbers of scans (V,)."""
         return self._keys, self._sums[self._rows], self._scans[self._rows]
 
@@ -108,7 +101,6 @@ class DriveScan(Generic[Item]):
     """A scan of a drive.
 
     Attributes:
-        item: what comes back with the result.
         xyz: (N, 3) coordinates of the points, metres.
         scores: (N, K) their scores, such as class probabilities. Points whose scores are all 0 are
             left alone.
@@ -125,7 +117,6 @@ class Fused(NamedTuple, Generic[Item]):
     """The consensus on the N points of a scan.
 
     Attributes:
-        item: what came with the scan.
         scores: (N, K) float32 fused probabilities; the rows of points without scores are 0.
         sights: (N,) int32 number of scans in reach that see the small voxel of each point.
     """
@@ -140,7 +131,6 @@ class _Seen(Generic[Item]):
     """A scan in reach.
 
     Attributes:
-        item: what came with the scan.
         logs: (N, K) float32 log scores of its points, in steps.
         is_fused: (N,) bool, the points that have scores.
         keys: the ascending keys of the small voxels (M,), and of the large ones.
@@ -172,13 +162,11 @@ class Consensus:
     Like the geometric mean of two networks, this is a late fusion, with time as a further view.
 
     Args:
-        size: edge of the small voxels, metres.
         reach: number of scans before a scan, and after it, that count.
         past_only: whether scans after a scan do not count, as on a robot.
     """
 
-    def __init__(self, size: float = SIZE, reach: int = REACH, past_only: bool = False) -> None:
-        self.size = size
+    def __init__(self, reach: int = REACH, past_only: bool = False) -> None:
         self.reach = reach
         self.ahead = 0 if past_only else reach
         self._tables: list[VoxelTable] = []  # of the small and of the large voxels
@@ -217,7 +205,7 @@ class Consensus:
         xyz = np.asarray(scan.xyz, np.float64)
         xyz = xyz if is_fused.all() else xyz[is_fused]
         world = xyz @ scan.pose[:3, :3].T + scan.pose[:3, 3]
-        index = np.floor(world / self.size).astype(np.int64)
+        index = np.floor(world / SIZE).astype(np.int64)
         small, first, inverse = np.unique(keys_of(index), return_index=True, return_inverse=True)
         large, parent = np.unique(keys_of(index[first] // 2), return_inverse=True)
         sums = sum_by(inverse, weighted, len(small))
@@ -291,8 +279,7 @@ def keys_of(index: NDArray[np.int64]) -> NDArray[np.int64]:
     Voxels have the same number if they are a multiple of 2^21 voxels apart in x, y and z.
     """
     x, y, z = (index & ((1 << _BITS) - 1)).T
-    keys: NDArray[np.int64] = x << (2 * _BITS) | y << _BITS | z
-    return keys
+    return x << (2 * _BITS) | y << _BITS | z
 
 
 def index_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:

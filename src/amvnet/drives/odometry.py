@@ -54,8 +54,7 @@ class Odometry:
     def __call__(self, xyz: NDArray[np.floating]) -> Poses:
         """Return the pose (4, 4) of the next scan, given its valid points (M, 3) in metres."""
         self._odometry.register_frame(np.asarray(xyz, np.float64), np.empty(0))
-        pose: Poses = self._odometry.last_pose.copy()
-        return pose
+        return self._odometry.last_pose.copy()
 
 
 @dataclass(frozen=True)
@@ -76,10 +75,7 @@ def check_fit(pairs: Iterable[Pair], name: str) -> None:
     """Check that poses fit the scans: that the surfaces of two scans meet in the world.
 
     With wrong poses, each wall is seen twice, and another motion brings the scans closer together:
-    none, a shorter one or a longer one.
-
-    Args:
-        name: the name of the poses in the message.
+    none, a shorter one or a longer one. The message begins with `name`.
 
     Raises:
         InputError: if the poses do not fit.

@@ -48,7 +48,6 @@ class WorldMap:
         labels: (V,) uint8 train ids.
         confidence: (V,) float32 probability of the label, in [0, 1].
         sights: (V,) uint16 number of scans that see the voxel.
-        taxonomy: the classes of the labels.
     """
 
     xyz: NDArray[np.float64]
@@ -89,7 +88,6 @@ class MapBuilder:
 
     Args:
         size: edge of the voxels, metres.
-        taxonomy: the classes of the scores.
     """
 
     def __init__(self, size: float, taxonomy: Taxonomy) -> None:
@@ -117,9 +115,7 @@ class MapBuilder:
         """Write the unfinished map, so that `restore` can continue it.
 
         Args:
-            path: the file, which appears whole or not at all.
             request: a text that tells this map from others.
-            done: the number of scans that were added.
         """
         keys, sums, scans = self._table.contents()
         with atomic_write(path) as part, part.open("wb") as file:
@@ -158,11 +154,7 @@ class MapBuilder:
         return done
 
     def build(self, keeps_movable: bool = False) -> WorldMap:
-        """Return the map.
-
-        Args:
-            keeps_movable: whether voxels of vehicles, two-wheelers and people are kept.
-        """
+        """Return the map; vehicles, two-wheelers and people only if it `keeps_movable`."""
         keys, sums, scans = self._table.contents()
         classes = self.taxonomy.size
         logs = torch.from_numpy(sums[:, :classes] / sums[:, classes : classes + 1] / STEPS)
@@ -185,8 +177,7 @@ class MapBuilder:
         """Return (K + 1,) bool: the classes whose points may move, by train id."""
         coarse = class_map("coarse")
         ids = [coarse.target.names.index(name) for name in MOVABLE]
-        is_movable: NDArray[np.bool_] = np.isin(coarse.table(self.taxonomy), ids)
-        return is_movable
+        return np.isin(coarse.table(self.taxonomy), ids)
 
 
 def check_ending(path: Path) -> None:

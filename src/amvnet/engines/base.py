@@ -34,12 +34,10 @@ class Engine:
     networks, and builds a model with these networks.
 
     Args and attributes:
-        name: the name of the engine: "torch", "onnx" or "int8".
-        model: AMVNet, whose two networks the engine runs.
+        name: "torch", "onnx" or "int8".
         method: how the points are scored, one of `METHODS`.
         tau: the threshold of the assertion, in [0, 1]; None if it is the threshold of the weights.
         device: the device that holds the points: "cpu", "cuda", "cuda:1", ...
-        precision: the precision of the two networks.
 
     Attributes:
         at_once: the number of scans to segment at the same time, each with its share of torch's
@@ -78,8 +76,7 @@ class Engine:
         """Return the scores of the points of a batch, which is on the device of the engine."""
         model = self.model
         if METHODS[self.method].has_two_networks:
-            scores: Scores = model(batch)
-            return scores
+            return model(batch)
         if self.method == "bev":
             g = model.score_polar(model.polar_view.project(batch))
             return Scores(g, _none_uncertain(g), rv=None, bev=g)

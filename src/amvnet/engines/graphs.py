@@ -43,9 +43,6 @@ class GraphCheck:
         """Score a batch; check the graphs on the first batch of each number of scans.
 
         The check compares the scores with and without graphs; it returns the scores without graphs.
-
-        Args:
-            score: scores a batch by a model whose networks are `Captured`.
         """
         if not self.is_passed or batch.count in self._checked:
             return score(batch)

@@ -91,15 +91,11 @@ class OnnxGraph(nn.Module):
     It computes with as many threads as torch would use in the calling thread.
 
     Args:
-        providers: ONNX Runtime's execution providers, the preferred one first.
         cache: the folder in which TensorRT keeps what it builds; without it, nothing is kept.
     """
 
     def __init__(
-        self,
-        content: bytes,
-        providers: Sequence[str] = PROVIDERS[-1:],
-        cache: Path | None = None,
+        self, content: bytes, providers: Sequence[str] = PROVIDERS[-1:], cache: Path | None = None
     ) -> None:
         super().__init__()
         self.content = content

@@ -37,7 +37,6 @@ class Analysis:
     Attributes:
         evaluation: the evaluation of every method that the weights have, including the three
             ensembles.
-        tau: the threshold of the weights.
         points: (BINS,) number of points by similarity, labelled or not.
         ensemble: (BINS, K + 1, K + 1) confusion matrices of the geometric mean, by similarity.
         head: (SWEPT_BINS, K + 1, K + 1) confusion matrices of the point head, by similarity.

@@ -148,19 +148,11 @@ def measure_doubts(scan: Scan, segmenter: Segmenter) -> PointDoubts:
 def _contradiction(
     f: torch.Tensor, g: torch.Tensor, label: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return how strongly both views contradict the labels, and the class that they agree on.
+    """Return how strongly both views (P, K) contradict the labels, and the class they agree on.
 
     Each view gives a probability to the class that both agree on, and a probability to the label.
     The contradiction is the smaller probability of the class minus the larger probability of the
-    label. It is 0 if this difference is negative, or if the point has no label.
-
-    Args:
-        f: (P, K) class probabilities of the range view.
-        g: (P, K) class probabilities of the bird's-eye view.
-        label: (P,) train ids.
-
-    Returns:
-        (P,) contradictions in [0, 1] and (P,) train ids.
+    label, in [0, 1]. It is 0 if this difference is negative, or if the point has no label.
     """
     agreed = (f * g).argmax(dim=1)
     column = (label.long() - 1).clamp_min(0)
@@ -214,16 +206,14 @@ def _middle_points(
     order = np.lexsort((squared_distance, group))
     group_starts = np.cumsum(sizes) - sizes
 
-    nearest: NDArray[np.intp] = order[group_starts]
-    return nearest
+    return order[group_starts]
 
 
 def _most_common(ids: NDArray[np.integer], group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """Return the most common id in each of `count` groups; among equals, the lowest id."""
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
-    most_common: NDArray[np.intp] = table.argmax(axis=1)
-    return most_common
+    return table.argmax(axis=1)
 
 
 def write_clusters(

@@ -111,7 +111,6 @@ class Evaluation:
             Each of the others counts the points between two `EDGES`. Points exactly on an edge are
             in no bin, as in SemanticKITTI's tool.
         points: number of points in these scans, labelled or not.
-        uncertain: number of uncertain points.
         asked: number of points for which it is known whether they are uncertain.
     """
 

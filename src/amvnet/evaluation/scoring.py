@@ -60,7 +60,6 @@ class Labeller:
     """Labels scans.
 
     Attributes:
-        label: a function that labels a scan by one or several methods.
         classes: a map from the classes of the labels, and from the classes of the data, to the
             classes that are scored; None if all three are the same.
         at_once: number of scans that `label` may take at the same time, each in a thread.
@@ -106,7 +105,7 @@ def evaluate(
     true_table = labeller.table(dataset.taxonomy)
     table = labeller.table(labeller.taxonomy)
     evaluation = Evaluation(taxonomy)
-    pictured = {record.name for record in _pictured(records)}
+    pictured = {record.name for record in evenly_spaced(records, MAX_PICTURES)}
 
     def label(record: ScanRecord, scan: Scan) -> tuple[ScanRecord, Scan, MethodLabels]:
         labels = labeller.label(record, scan)
@@ -157,11 +156,8 @@ def _drive_scan(item: Labelled, drives: Drives) -> DriveScan[Labelled]:
 
 def pictures_of(records: Sequence[ScanRecord], folder: Path) -> dict[Path, Signature]:
     """Return the pictures that `evaluate` draws of some scans into a folder, by their paths."""
-    return {_picture_of(record, folder): PICTURE for record in _pictured(records)}
-
-
-def _pictured(records: Sequence[ScanRecord]) -> Sequence[ScanRecord]:
-    return evenly_spaced(records, MAX_PICTURES)
+    pictured = evenly_spaced(records, MAX_PICTURES)
+    return {_picture_of(record, folder): PICTURE for record in pictured}
 
 
 def _picture_of(record: ScanRecord, folder: Path) -> Path:

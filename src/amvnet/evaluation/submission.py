@@ -21,7 +21,7 @@ from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.labels.ids import check_size, train_ids
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, listed
 from amvnet.files import atomic_write
 from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
@@ -55,9 +55,7 @@ class Rules:
     """What an archive must and may contain.
 
     Attributes:
-        taxonomy: the classes.
         points: the number of points of each required prediction, by the name of its file.
-        dtype: the number type of the ids.
         unlabelled: whether points may have no class (train id 0).
         folders: names of the entries for folders, outer folders first, each with a trailing slash.
         meta: name of submission.json, which declares what the method uses; None if the benchmark
@@ -86,10 +84,6 @@ class Rules:
 
 def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = None) -> Rules:
     """Return the rules for the archive of one split, or of some sequences.
-
-    Args:
-        split: a split. The servers score "test"; other splits are for trials.
-        sequences: sequences or scenes to pack instead of a split.
 
     Raises:
         InputError: if the dataset's benchmark has no server, or the dataset has no such scans.
@@ -171,10 +165,7 @@ RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuS
 
 
 def _count_points(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, int]:
-    points = {}
-    for record in records:
-        points[record.prediction] = dataset.count_points(record)
-    return points
+    return {record.prediction: dataset.count_points(record) for record in records}
 
 
 def write_archive(
@@ -190,13 +181,10 @@ def write_archive(
     scores or other splits, are left out. Only one scan at a time is in memory.
 
     Args:
-        rules: the rules of the benchmark's server.
         folder: folder with the predictions, under the file names of `rules`.
         out: the archive, NAME.zip. It appears whole or not at all.
         use_external: whether the method also learnt from data outside the benchmark. Only archives
             for nuScenes state it.
-        progress: called before each file and at the end, with the number of files that are done and
-            their total.
 
     Raises:
         InputError: if a prediction is missing or breaks the rules, or the archive cannot be
@@ -213,10 +201,9 @@ def write_archive(
     names = sorted(rules.points)
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
-        others = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise InputError(
             f"{folder}: expected a prediction for each of {len(names)} scans, "
-            f"found no {missing[0]}{others}; predict these scans too, "
+            f"found no {listed(missing, 1)}; predict these scans too, "
             "or select predicted ones with --sequences or --split"
         )
     for name in names:

@@ -121,10 +121,8 @@ def _legend_entries(view: TopView) -> list[tuple[str, Color]]:
     class_ids = np.unique([view.truth, *view.predictions.values()]).tolist()
 
     colors = class_colors(view.taxonomy)
-    entries: list[tuple[str, Color]] = []
-    for class_id in class_ids:
-        if class_id > 0:
-            entries.append((view.taxonomy.names[class_id], colors[class_id]))
+    names = view.taxonomy.names
+    entries = [(names[class_id], colors[class_id]) for class_id in class_ids if class_id > 0]
     entries.append(("wrong", WRONG))
     if view.uncertain is not None:
         entries.append(("uncertain", UNCERTAIN))

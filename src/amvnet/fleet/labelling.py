@@ -59,10 +59,8 @@ class LabelScans:
     drive in the batch, so scans of one drive should follow one another.
 
     Args:
-        request: how the scans are labelled, and which files are written.
         compute: the device, and the number of scans that are computed at the same time. The engine
             and the precision are in the request.
-        batch: the number of scans that go through the networks together.
 
     Raises:
         InputError: if this machine lacks the device, or a library for the engine.
@@ -212,10 +210,7 @@ def _fetch(
     drive: Sequence[Row], reader: FileReader, request: LabellingRequest
 ) -> Iterator[tuple[list[FileScan], Path]]:
     """Yield the scans of a drive and a temporary folder for labels; fetch the files ahead."""
-    with (
-        temporary_folder() as temporary,
-        ThreadPoolExecutor(TRANSFERS) as pool,
-    ):
+    with temporary_folder() as temporary, ThreadPoolExecutor(TRANSFERS) as pool:
         scans = []
         for index, row in enumerate(drive):
             folder = temporary / str(index)

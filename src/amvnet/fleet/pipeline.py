@@ -65,8 +65,6 @@ class Cluster:
             is started on this machine.
         workers: the largest number of workers; by default, Ray starts as many workers as the
             cluster has room for.
-        compute: the device, and how the networks compute.
-        batch: the number of scans that go through the networks together.
     """
 
     address: str | None = None
@@ -88,18 +86,15 @@ def label_fleet(
     """Label scan files on a Ray cluster, and write a table of results.
 
     Args:
-        inputs: the scans, as `list_scans` takes them.
         report: takes lines about what was assumed of the sensors, and how sure the labels are.
 
     Returns:
         The number of label files of these scans that exist, counted in the output folder.
 
     Raises:
-        InputError: if an input or the output folder cannot be used.
-        InputError: if the earlier run had another request.
-        InputError: if two scans have the same name; earlier windows are then labelled.
-        InputError: if the workers cannot run.
-        InputError: if all scans are broken.
+        InputError: if an input or the output folder cannot be used, the earlier run had another
+            request, the workers cannot run, or all scans are broken; or if two scans have the same
+            name (earlier windows are then labelled).
         SomeBroken: if some scans are broken; all others are then labelled.
         OSError: if labels cannot be written.
     """
@@ -139,8 +134,6 @@ class FleetRun:
     """A run over the scans of a fleet, window by window: plan, measure the drives, label.
 
     Attributes:
-        results: the table of results; it knows the scans that an earlier run has done.
-        resources: the resources of each worker, as options of Ray.
         progress: called with the number of scans that are done, and their total so far.
     """
 
@@ -261,16 +254,10 @@ class FleetRun:
         resources: dict[str, Any],
         max_lost: int = -1,
     ) -> Generator[pa.Table]:
-        """Let workers process blocks.
+        """Yield the table that a worker returns for each block, except for lost blocks.
 
-        Args:
-            kind: the class of the workers; a worker takes one block at a time.
-            resources: the resources of each worker, as options of Ray.
-            max_lost: the largest number of blocks that may be lost; -1 sets no limit.
-
-        Yields:
-            The table that a worker returns for each block, except for lost blocks. A block is lost
-            if every worker that takes it ends.
+        A block is lost if every worker that takes it ends; at most `max_lost` may be, or any number
+        if this is -1.
         """
         context = ray.data.DataContext.get_current()
         context.enable_progress_bars = False

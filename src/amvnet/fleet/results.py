@@ -79,7 +79,6 @@ class Results:
     removed, so that each scan has one row.
 
     Attributes:
-        done: the names of the scans that an earlier run has done.
         estimates: the `estimates` of `describe_drive`, for each drive that is measured.
 
     Raises:
@@ -109,7 +108,8 @@ class Results:
                 "--resume to continue it, or change --out"
             )
         _check_same(place, request.settings)
-        self._remove_unfinished()
+        if self.out.local is not None:
+            remove_unfinished(self.out.local)
         self._keep_done()
         self._take_estimates(self._read_drives())
 
@@ -145,11 +145,6 @@ class Results:
                     "found another file; move it away"
                 )
         return names
-
-    def _remove_unfinished(self) -> None:
-        """Remove the unfinished files that killed processes have left on this machine."""
-        if self.out.local is not None:
-            remove_unfinished(self.out.local)
 
     def _keep_done(self) -> None:
         """Collect the scans that are done, and remove the rows of all other scans."""

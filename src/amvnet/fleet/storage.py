@@ -28,8 +28,6 @@ class Place:
 
     Attributes:
         address: the URL that the user wrote, which may hold credentials; or an absolute path.
-        filesystem: pyarrow's filesystem that holds the place.
-        path: the path in the filesystem.
     """
 
     address: str
@@ -108,12 +106,9 @@ class Place:
     def walk(self, prefix: str = "") -> Iterator[tuple[str, Place, list[str]]]:
         """Yield the folder and all folders below it that are not hidden, with their files.
 
-        Args:
-            prefix: the path of the folder relative to the first one, such as "drive/".
-
         Yields:
-            The path of a folder relative to the first one, the folder, and the sorted names of its
-            files.
+            `prefix` and the path of a folder relative to this one, such as "drive/"; the folder;
+            and the sorted names of its files.
 
         Raises:
             InputError: if a folder cannot be listed.
@@ -186,8 +181,7 @@ def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
     shown_root = without_secrets(root)
     with reaching(shown_root), suppress(pa.ArrowInvalid):  # not a scheme of pyarrow
         uri = f"{root}{URL_OPTIONS.get(scheme, '/')}"
-        opened: tuple[fs.FileSystem, str] = fs.FileSystem.from_uri(uri)
-        return opened
+        return fs.FileSystem.from_uri(uri)
     try:
         opened = fs.FileSystem.from_uri(f"fsspec+{root}")
     except (ImportError, ValueError) as error:

@@ -16,7 +16,6 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
 
     Args:
         text: a dataset, a scan file, a folder of scan files, or `SIMULATED`.
-        weights: the weights for which the scans are prepared.
 
     Raises:
         InputError: if there are no scans, one is broken, or the weights' sensor cannot be

@@ -57,7 +57,6 @@ class Drives:
     Attributes:
         poses: the pose (4, 4) of each scan, by the recording and the name of the scan; it moves the
             points of the scan's file, in metres.
-        past_only: whether scans after a scan do not count.
         table: maps the labels to other classes; by default, they stay unchanged.
     """
 
@@ -149,7 +148,6 @@ def drive(
     later, or at once if only past scans count.
 
     Args:
-        segmenter: segments each scan.
         scans: consecutive scans of one recording, as `Segmenter.__call__` takes arrays and `Scan`s.
         poses: the pose (4, 4) of each scan, which moves its points into the world, metres. By
             default, KISS-ICP estimates them (`pip install "amvnet[drives]"`).
@@ -236,7 +234,6 @@ def find_poses(
         scans: the scans; those of each recording are in order.
         path: the file of the poses of the only drive (`read_poses`), or a topic of bags, if no file
             has this name (`BagPoses`).
-        past_only: whether only scans before a scan will count.
         is_one: whether all scans must be of one drive.
 
     Raises:

@@ -130,7 +130,6 @@ class Fused(NamedTuple):
     """The result of `fuse_files`.
 
     Attributes:
-        files: the number of label files.
         uncertain: the share of the points on which the two models disagree, in [0, 1].
         silent: by side ("a" or "b"), the share of the points without an opinion of its model, in
             [0, 1].
@@ -155,7 +154,6 @@ def fuse_files(
     """Fuse two models' scores of scans, and write the labels as `predict` writes them.
 
     Args:
-        inputs: the scans, as `list_inputs` takes them.
         head, tau: as for `fuse`; `head` is weights that have a point head.
         taxonomy: the classes if there is no head; by default the classes of the inputs.
 

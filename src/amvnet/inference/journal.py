@@ -57,8 +57,6 @@ class Journal:
     Leaving a `with` block closes the file; the run stays unfinished unless `close` ended it.
 
     Args:
-        folder: the output folder; it is made if it is missing.
-        settings: all that the output depends on, in JSON types.
         done: entries of an earlier run that stay valid, from `read_journals`.
     """
 

@@ -38,7 +38,6 @@ class ScanOptions:
 
     Attributes:
         sequences: the sequences or scenes to use of datasets; by default the sequences of `split`.
-        split: the official split to use of datasets.
         topic: the topic to read in bags; by default the only one with scans.
         layout: the names of the columns in files that do not name them.
     """
@@ -54,7 +53,6 @@ class LoadedScan:
     """A scan in memory.
 
     Attributes:
-        scan: the scan, ready for the segmenter.
         file_xyz: (N, 3) the unchanged coordinates of the scan's file; None for a scan of a dataset.
     """
 
@@ -69,7 +67,6 @@ class InputScan(ABC):
         name: the name in messages, unique among the scans of one input.
         title: a short name for people who look at the scan.
         source: the recording of the scan: a sequence, a bag or a folder.
-        path: the file that holds the scan.
         scores_path: the path of the `.npz` of its scores, relative to a folder of predictions.
         bag: the poses of the bag that holds the scan; None if no bag does.
         corrected: the place of the scan's corrected labels, relative to the folder of the dataset.
@@ -92,10 +89,7 @@ class InputScan(ABC):
 
     @abstractmethod
     def load(self, labels: bool = False) -> LoadedScan:
-        """Read the scan.
-
-        Args:
-            labels: also read the ground truth, if there is any.
+        """Read the scan; if `labels`, with the ground truth, if there is any.
 
         Raises:
             InputError: if the scan cannot be read.
@@ -109,37 +103,27 @@ class InputScan(ABC):
     def labels_path(self, kind: str) -> Path:
         """Return the path of the scan's label file, relative to a folder of predictions.
 
-        Args:
-            kind: the format, one of `writers.KINDS`; datasets have their own format.
+        `kind` is the format, one of `writers.KINDS`; datasets have their own format.
         """
 
     @abstractmethod
     def read_labels(self, path: Path, count: int) -> np.ndarray:
-        """Read the (N,) train ids of the points; raise InputError if they cannot be read.
+        """Read the (N,) train ids of N = `count` points; raise InputError if they cannot be read.
 
-        Args:
-            path: a folder of predictions, or the label file of a scan that is in no dataset.
-            count: N, the number of points.
+        `path` is a folder of predictions, or the label file of a scan that is in no dataset.
         """
 
     @abstractmethod
     def write_labels(
         self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str
     ) -> Path:
-        """Write labels into a folder of predictions; return the path of the file.
-
-        Args:
-            loaded: what `load` returned.
-            kind: the format, as `labels_path` takes it.
-        """
+        """Write labels into a folder of predictions; return the path of the file."""
 
 
 class DatasetScan(InputScan):
     """A scan of a dataset, whose labels have the dataset's format.
 
     Args:
-        dataset: the dataset.
-        record: the scan.
         written: the classes of the labels that are written; by default the classes of the dataset.
         sensor: marks the points of the car's own body (`mark_own`); without it, none are marked.
     """
@@ -209,9 +193,6 @@ class FileReader:
 
     Scans that were read to measure their sensor are kept until they are needed, so that no file is
     read twice.
-
-    Args:
-        normaliser: normalises the scans; without it, they stay unchanged.
     """
 
     def __init__(self, normaliser: Normaliser | None) -> None:
@@ -251,13 +232,7 @@ class FileReader:
 
 
 class FileScan(InputScan):
-    """A scan in a file or a bag.
-
-    Args:
-        scan: the scan.
-        reader: reads the scan.
-        taxonomy: the classes of its labels in files.
-    """
+    """A scan in a file or a bag."""
 
     def __init__(self, scan: NamedScan, reader: FileReader, taxonomy: Taxonomy) -> None:
         super().__init__(scan.name, scan.name, scan.source, scan.path, Path(f"{scan.name}.npz"))
@@ -319,7 +294,6 @@ def list_inputs(
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, a folder of these, or
             a pattern as `find_scans` takes it.
-        options: which scans of the inputs to use.
         taxonomy: the classes of the weights, or the classes that the user names. By default, a
             dataset has its own classes, a scan file whose name ends in `.pcd.bin` has the classes
             of nuScenes, and any other scan file has the classes of SemanticKITTI.

@@ -97,12 +97,7 @@ def load_with(
     made: Engine
     if compute.engine == "torch":
         made = TorchEngine(
-            loaded,
-            method,
-            tau,
-            device=compute.device,
-            precision=compute.precision,
-            graphs=graphs,
+            loaded, method, tau, device=compute.device, precision=compute.precision, graphs=graphs
         )
     else:
         check_method(method, loaded.parts)  # before the export, which takes long

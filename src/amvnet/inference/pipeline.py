@@ -44,7 +44,6 @@ class OutputOptions:
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.
         uncertain: also write which points are uncertain, (N,) bool, as `.uncertain.npy`.
-        overwrite: replace files that exist.
         resume: leave out the scans that an earlier run into the same folder has done.
         also_read: other files that the command reads, which must not be replaced; what names no
             file is ignored.
@@ -85,7 +84,6 @@ class Pipeline:
             rounding.
         at_once: the number of batches that are segmented at the same time, each with its share of
             the threads.
-        drives: the poses of the scans, if their scores are to be fused over time.
     """
 
     scans: Sequence[InputScan]

@@ -42,7 +42,6 @@ def predict(
     """Segment datasets, scan files, bags and folders of them.
 
     Args:
-        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
         request: how the scans are labelled, and which files are written for each; its precision is
             not "auto", so that the journal says what the labels depend on.
         make_segmenter: returns the segmenter that computes the labels, with the weights, method and

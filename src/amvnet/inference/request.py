@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from amvnet.config.bounds import Bounded
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
@@ -24,19 +23,13 @@ UNKNOWN_SENSOR = Sensor()
 
 
 @dataclass(frozen=True)
-class LabellingRequest(Bounded):
+class LabellingRequest:
     """A request for labels: it holds all that label files depend on, except the scans themselves.
 
     Attributes:
         method, tau, precision: as `amvnet.load` takes them.
-        sensor: what is known about the sensor of scan files; the rest is measured.
-        layout: the names of the columns in files that do not name them.
-        topic: the topic to read in bags; None selects the only one with scans.
         classes: maps the classes of the weights to the classes that are written. By default, the
             classes of the weights are written.
-        kind: the format of the labels of scan files, one of `writers.KINDS`.
-        scores: whether to write the probabilities of both networks.
-        uncertain: whether to write which points are uncertain.
         drive: the digest of the poses by which scores are fused over time; None if they are not.
 
     Raises:
@@ -60,7 +53,6 @@ class LabellingRequest(Bounded):
     drive: str | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         check_kind(self.kind)
         check_method(self.method, self.weights.parts)
         if self.tau is not None:

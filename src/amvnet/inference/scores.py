@@ -43,7 +43,6 @@ class ScoreFolder:
         side: "a" or "b". In a file of `amvnet predict --scores`, a is the range-view network, and b
             is the bird's-eye-view network.
         folder: the folder of the files, in the layout of `amvnet predict --scores`.
-        logits: whether the scores are logits instead of probabilities.
 
     Raises:
         InputError: if there is no such folder.
@@ -161,10 +160,6 @@ def as_probabilities(values: np.ndarray, name: str, advice: str) -> np.ndarray:
     Other tools write a row of zeros for a point outside their view: the model has no opinion of it.
     Such a row becomes 1/K in every class.
 
-    Args:
-        name: the beginning of error messages.
-        advice: the advice in the message if the scores are no probabilities.
-
     Raises:
         InputError: if a value is negative or not finite, a row does not add up to 1, or all rows
             are zeros.
@@ -202,8 +197,7 @@ def are_probabilities(values: np.ndarray) -> np.ndarray:
 
 def have_opinion(values: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (P,) bool: whether each row of (P, K) probabilities prefers a class."""
-    is_opinion: NDArray[np.bool_] = (values != values[:, :1]).any(axis=1)
-    return is_opinion
+    return (values != values[:, :1]).any(axis=1)
 
 
 def check_logits(values: np.ndarray, name: str) -> None:

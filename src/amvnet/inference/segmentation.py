@@ -77,7 +77,9 @@ class Segmentation:
     def __repr__(self) -> str:
         parts = [f"<Segmentation of {len(self):,} points"]
         if self.origin is not None and len(self):
-            parts.append(f": {self._most_frequent()}")
+            shown = list(self.counts().items())[:SHOWN_CLASSES]
+            shares = [f"{count / len(self):.0%} {name}" for name, count in shown]
+            parts.append(f": {', '.join(shares)}")
         if self.verdict is not None:
             what = "uncertain" if self.has_two_networks else "mean entropy"
             parts.append(f"; {self.verdict.share:.1%} {what}")
@@ -85,11 +87,6 @@ class Segmentation:
                 parts.append(", not to be relied on")
 
         return "".join([*parts, ">"])
-
-    def _most_frequent(self) -> str:
-        """Return the most frequent classes and their shares, as text."""
-        shown = list(self.counts().items())[:SHOWN_CLASSES]
-        return ", ".join(f"{count / len(self):.0%} {name}" for name, count in shown)
 
     def counts(self) -> dict[str, int]:
         """Return the number of points of each class that occurs, by its name, most first."""
@@ -131,8 +128,7 @@ class Segmentation:
     @property
     def confidence(self) -> NDArray[np.float32]:
         """(N,) probability of each point's label, in [0, 1]; 0 for points that are not valid."""
-        largest: NDArray[np.float32] = self.probabilities.max(axis=1, initial=0)
-        return largest
+        return self.probabilities.max(axis=1, initial=0)
 
     @property
     def points(self) -> NDArray[np.floating]:
@@ -153,8 +149,7 @@ class Segmentation:
     @property
     def raw_ids(self) -> NDArray[np.uint32]:
         """(N,) the labels as ids of the benchmark's files (a car of SemanticKITTI is 10)."""
-        raw: NDArray[np.uint32] = self.require_origin().taxonomy.to_raw(self.labels)
-        return raw
+        return self.require_origin().taxonomy.to_raw(self.labels)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -271,10 +266,8 @@ def scores_by_method(
 ) -> dict[str, Tensor]:
     """Return the scores (P, K) by a method and by the methods that it includes.
 
-    AMVNet and the ensembles include all ensembles and each single network.
-
-    Args:
-        vote: returns the scores by rv-knn, given the scores of the range view.
+    AMVNet and the ensembles include all ensembles and each single network. `vote` returns the
+    scores by rv-knn, given those of the range view.
     """
     f = scores.rv
     g = scores.bev

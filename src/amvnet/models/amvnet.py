@@ -52,7 +52,6 @@ class LateFusion(nn.Module):
     """The fusion of any two networks' class probabilities (sections 3.2 and 3.3 of the paper).
 
     Args:
-        assertion: decides which points are uncertain.
         point_head: classifies the uncertain points. If it is None, the ensemble of the two
             networks classifies them.
 

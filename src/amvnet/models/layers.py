@@ -49,8 +49,7 @@ def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
     if not x.requires_grad:
         return _pad_width(x, left, right)
 
-    wrapped: Tensor = _WrapWidth.apply(x, left, right)  # type: ignore[no-untyped-call]
-    return wrapped
+    return _WrapWidth.apply(x, left, right)  # type: ignore[no-untyped-call]
 
 
 def _pad_width(x: Tensor, left: int, right: int) -> Tensor:
@@ -145,7 +144,6 @@ class AzimuthGRU(nn.Module):
     these copies are dropped.
 
     Args:
-        channels: C, number of channels of the map.
         padding: share of the columns that are copied, 0 to 1.
     """
 

@@ -42,7 +42,6 @@ class Method:
     """One way to label points.
 
     Attributes:
-        title: its name in tables and figures.
         parts: the parts of a weights file that the method needs.
         ensemble: combines the class probabilities f and g of the two networks, or None if the
             method is no ensemble.

@@ -47,8 +47,7 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     slot = np.empty(len(xyz), dtype=np.int64)  # each point, or the last one kept in its place
     slot[order] = is_kept.cumsum() - 1
     queries, rows = np.unique(slot[own], return_inverse=True)
-    nearest: np.ndarray = kept[_nearest_others(xyz[kept], queries, n)][rows]
-    return nearest
+    return kept[_nearest_others(xyz[kept], queries, n)][rows]
 
 
 def _may_have_crowds(xyz: np.ndarray, most: int) -> bool:
@@ -84,13 +83,7 @@ def _nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
 def _search(
     query: Query, xyz: np.ndarray, own: np.ndarray, rows: np.ndarray, nearest: np.ndarray
 ) -> np.ndarray:
-    """Write the rows (R,) of `nearest` (U, n), `QUERIES_AT_ONCE` at a time.
-
-    The other arguments and the result are those of `nearest_others`.
-
-    Returns:
-        (R,) bool, whether the last neighbour of each row has a tie; see `Query`.
-    """
+    """Write the rows (R,) of `nearest` (U, n); return (R,) bool, which have a tie (`Query`)."""
     is_tied = np.empty(len(rows), dtype=bool)
     for start in range(0, len(rows), QUERIES_AT_ONCE):
         part = rows[start : start + QUERIES_AT_ONCE]

@@ -113,13 +113,10 @@ def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
 
 
 def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
-    """Divide some points of a scan into parts by their azimuth.
+    """Return the places in `index` of parts of some points, at most `POINTS_AT_ONCE` in each.
 
     Points of similar azimuth share neighbours, so that the points of a part have few neighbours
     together.
-
-    Returns:
-        For each part, the places of its points in `index`: at most `POINTS_AT_ONCE` places.
     """
     if len(index) <= POINTS_AT_ONCE:
         return [slice(None)]

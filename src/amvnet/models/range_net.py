@@ -62,10 +62,7 @@ class RangeNet(nn.Module):
     def encode(self, x: Tensor) -> list[Tensor]:
         """Return the maps of all stages, whose width strides are 2, 4, 8, ...
 
-        The last `RECURRENT_STAGES` maps are the outputs of the GRUs.
-
-        Args:
-            x: (B, stem, H, W), the map at full resolution.
+        The last `RECURRENT_STAGES` maps are the outputs of the GRUs. x is (B, stem, H, W).
         """
         maps = []
         first_recurrent = len(self.stages) - len(self.recurrent)
@@ -122,11 +119,7 @@ def surface_steps(image: Tensor) -> Tensor:
 
 
 def _steps(start: Tensor, end: Tensor) -> Tensor:
-    """Return the steps from pixels to others, 0 where one of both has no point.
-
-    Args:
-        start, end: (B, 3, H, W): the horizontal distance, the height and the mask.
-    """
+    """Return the steps between pixels (distance, height, mask), 0 where one has no point."""
     step = torch.asinh((end[:, :2] - start[:, :2]) / SMALL_STEP)
     return step * (start[:, 2:] * end[:, 2:])
 

@@ -13,8 +13,7 @@ def apply_to_joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
     """Apply a `ConvBlock` to `torch.cat([upsample(coarse, fine), fine], dim=1)`."""
     convolution, norm, activation = block.children()
     assert isinstance(convolution, RingConv2d)
-    output: Tensor = activation(norm(convolve_joined(convolution, coarse, fine)))
-    return output
+    return activation(norm(convolve_joined(convolution, coarse, fine)))
 
 
 def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Tensor:
@@ -27,7 +26,6 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     are s kernels. This is half of the work.
 
     Args:
-        convolution: the convolution, over C + C' channels.
         coarse: (B, C, h, w). It is really upsampled if H is not a multiple of h, or W is not a
             multiple of w.
         fine: (B, C', H, W).
@@ -35,8 +33,7 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     scale = (fine.shape[2] // coarse.shape[2], fine.shape[3] // coarse.shape[3])
     is_multiple = fine.shape[2:] == (coarse.shape[2] * scale[0], coarse.shape[3] * scale[1])
     if not is_multiple:
-        output: Tensor = convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
-        return output
+        return convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
 
     coarse_weight = convolution.weight[:, : coarse.shape[1]]
     fine_weight = convolution.weight[:, coarse.shape[1] :]

@@ -53,9 +53,6 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
 
     Spinning threads need no waking, and would keep the processors from the threads that run the
     parts. If threads spin, the parts run one after the other.
-
-    Args:
-        parts: the arguments of `run`.
     """
     import torch
 

@@ -122,10 +122,6 @@ def trained_sensor(name: str, measured: SensorGeometry) -> Sensor:
     """Return the sensor of a training: what was measured of it, else what its data sheet says.
 
     It has the name of the data sheet only if the number of its lasers is that of the sheet.
-
-    Args:
-        name: the name of the sensor in the recipe.
-        measured: what the scans of the training show.
     """
     sheet = KNOWN_SENSORS.get(name, Sensor())
     height = KNOWN_HEIGHTS.get(name)

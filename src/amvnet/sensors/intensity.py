@@ -106,10 +106,6 @@ def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarra
     Linear interpolation maps the intensities between two quantiles. Equal quantiles, of many zeros
     for example, become the mean of the training's quantiles at their probabilities.
 
-    Args:
-        quantiles: the quantiles of the scans at `PROBABILITIES`, ascending.
-        trained: the quantiles of the training at `PROBABILITIES`.
-
     Returns:
         (Q,) distinct quantiles, ascending, and (Q,) intensities in [0, 1].
     """
@@ -187,7 +183,6 @@ class IntensityMap:
     """How the intensities of some scans become intensities that some weights know.
 
     Attributes:
-        text: describes the map to the user.
         scale: the divisor of the intensities, or None if they are matched or filled in.
         matched: what `matching` returns, or None if the intensities are not matched.
         trained: fills in missing intensities. If it is None, they become zeros.
@@ -223,9 +218,6 @@ def intensity_map(
     Args:
         quantiles: the quantiles of the raw intensities at `PROBABILITIES`, or None if there are no
             intensities.
-        scale: the largest possible intensity.
-        trained: the intensities of the training, or None if these are unknown.
-        is_given: whether the user gave the scale.
     """
     if quantiles is None:
         return IntensityMap(f"no intensity ({describe_filler(trained)})", trained=trained)
@@ -266,9 +258,6 @@ def fill_intensity(scan: Scan, trained: TrainedIntensity | None) -> tuple[Scan, 
 
     A few missing intensities become the median of the others. If more than `MAX_MISSING_SHARE` are
     missing, the scan becomes one without intensities: real ones among many zeros would mislead.
-
-    Args:
-        trained: the intensities of the training, or None if these are unknown.
 
     Returns:
         The scan, and in words what was missing and what replaces it; empty if nothing was missing.

@@ -65,9 +65,6 @@ def order_rings(scan: Scan) -> tuple[Scan, str]:
     lasers ascend. Some drivers count from the highest laser, or in the order in which the lasers
     fire. Rings that hold other numbers are left out.
 
-    Args:
-        scan: a scan with the sensor at the origin; the sensor may be tilted.
-
     Returns:
         The scan, and in words what was wrong and done; empty if the rings are in order.
     """
@@ -112,8 +109,7 @@ def _elevations_of_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[np.ndarray,
     """
 
     def means_of(values: np.ndarray) -> np.ndarray:
-        means: np.ndarray = np.bincount(ring, values) / np.maximum(np.bincount(ring), 1)
-        return means
+        return np.bincount(ring, values) / np.maximum(np.bincount(ring), 1)
 
     elevation = elevations(xyz)
 

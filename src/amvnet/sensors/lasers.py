@@ -77,11 +77,8 @@ class SensorGeometry:
 
     def override(self, sensor: Sensor) -> SensorGeometry:
         """Return the geometry with its values replaced by the known values of a sensor."""
-        changes = {}
-        for key in MEASURES:
-            if getattr(sensor, key) is not None:
-                changes[key] = getattr(sensor, key)
-        return dataclasses.replace(self, **changes)
+        stated = SensorGeometry(**{key: getattr(sensor, key) for key in MEASURES})
+        return dataclasses.replace(self, **stated.known())
 
 
 def _is_near(angle: float | None, other: float | None) -> bool:
@@ -151,7 +148,4 @@ def _with_laser_ends(
 
 def elevations(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the (N,) elevations of (N, 3) points, degrees above the horizon."""
-    degrees: NDArray[np.floating] = np.degrees(
-        np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
-    )
-    return degrees
+    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))

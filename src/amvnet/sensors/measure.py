@@ -28,8 +28,6 @@ class Estimate:
     """What was measured about the sensor of a scan, or the median over several scans.
 
     Attributes:
-        frame: the frame of the coordinates in the files.
-        lasers: the sensor's geometry, without its height.
         quantiles: the quantiles of the intensities in the files at `PROBABILITIES`, or None if the
             files have no intensities.
         is_steady: whether the scans were recorded in one frame, at one height.
@@ -84,10 +82,6 @@ class Recording:
     If the first scans are from several sensors, each scan gets its own estimate. So does a later
     scan from another sensor.
 
-    Args:
-        sensor: what is known about the sensor; the rest is measured.
-        usual_height: height of the weights' sensor, metres; see `Frame.rises`.
-
     Attributes:
         usual: the median of the estimates. It is None before a scan is measured, and if there are
             several sensors.
@@ -96,7 +90,7 @@ class Recording:
     def __init__(self, sensor: Sensor, usual_height: float | None) -> None:
         self.usual: Estimate | None = None
         self._sensor = sensor
-        self._usual_height = usual_height
+        self._usual_height = usual_height  # as `Frame.rises` takes it
         self._first: list[Estimate] = []
         self._is_learnt = False
 
@@ -210,15 +204,10 @@ def seen_scan(
         usual_height: as `Frame.rises` takes it.
         intensity: (N,) intensities in [0, 1]; by default zeros.
     """
-    scan = level_scan(cloud, frame.complete(sensor), intensity)
+    xyz = frame.complete(sensor).to_level(cloud.xyz)
+    scan = dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
     to_sensor, _ = frame.rises(sensor, usual_height)
     return order_rings(raise_points(scan, to_sensor))
-
-
-def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:
-    """Return a scan in metres and in the package's axes, with intensities (N,) or zeros."""
-    xyz = sensor.to_level(cloud.xyz)
-    return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 
 
 def raise_points(scan: Scan, rise: float) -> Scan:

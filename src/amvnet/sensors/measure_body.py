@@ -43,11 +43,7 @@ class Body:
 def measure_body(scans: Sequence[Callable[[], Cloud]], sensor: Sensor) -> Body | None:
     """Return the body of the car that recorded some scans; None if none is found or is known.
 
-    Scans that cannot be read are left out.
-
-    Args:
-        scans: read the scans, in the order of the drive.
-        sensor: what is known about the sensor.
+    `scans` read them in the order of the drive. Scans that cannot be read are left out.
     """
     if sensor.keep_own or sensor.own_body is not None or not scans:
         return None

@@ -53,9 +53,6 @@ def normalise(
     the lasers decide `Scan.row`. Otherwise the elevations decide it, under which the sensor saw the
     points before the move.
 
-    Args:
-        sensor: what is known about the sensor; it takes precedence over the estimate.
-
     Raises:
         InputError: if no point is usable.
     """
@@ -80,11 +77,7 @@ def normalise(
 def describe(
     cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation, ring_fault: str
 ) -> str:
-    """Return one line: what is assumed about a scan, and whether the weights know its sensor.
-
-    Args:
-        ring_fault: what was wrong with the rings of the scan, as `normalise` returns it.
-    """
+    """Return one line: what is assumed about a scan, and whether the weights know its sensor."""
     lasers = estimate.lasers.override(sensor)
     assumed = [
         cloud.note,

@@ -24,7 +24,6 @@ def own_points(xyz: np.ndarray, ring: np.ndarray | None, sensor: Sensor) -> np.n
     Args:
         xyz: (N, 3 or more) the points in the axes of their file, metres.
         ring: (N,) index of each point's laser, or None if it is unknown.
-        sensor: what is known about the sensor.
     """
     if sensor.keep_own:
         return None

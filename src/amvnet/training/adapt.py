@@ -66,11 +66,6 @@ class TaughtScans(Dataset):
     """The scans of drives, with the labels that their consensus gives.
 
     `Dataset` documents the methods and their errors.
-
-    Args:
-        scans: the scans, normalised to the weights.
-        folder: the folder of the labels.
-        weights: the weights that gave the labels.
     """
 
     def __init__(self, scans: Sequence[InputScan], folder: Path, weights: Weights) -> None:
@@ -101,8 +96,7 @@ class TaughtScans(Dataset):
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
         """Return the (N,) train ids that teach; 0 for points that teach nothing."""
         assert record.labels_path is not None
-        ids: np.ndarray = np.load(record.labels_path, allow_pickle=False)
-        return ids
+        return np.load(record.labels_path, allow_pickle=False)
 
     def train_ids_by_raw(self) -> np.ndarray:
         """Return each train id as its own raw id."""
@@ -125,11 +119,9 @@ def teach(
     """Label the scans of drives, and write what their consensus teaches.
 
     Args:
-        scans: the scans, those of each drive in order.
-        drives: their poses, or None if each scan teaches by its own labels.
-        segmenter: labels the scans by both networks.
+        drives: the poses of the scans, which are in order, or None if each scan teaches by its own
+            labels.
         folder: the folder for the labels, or None to write nothing.
-        progress: called with the number of scans that are done, and their total.
 
     Raises:
         InputError: if a scan cannot be read or segmented, or no point teaches.
@@ -163,10 +155,7 @@ def teach(
 
 
 def _fused(
-    scans: Sequence[InputScan],
-    drives: Drives | None,
-    segmenter: Segmenter,
-    progress: Progress,
+    scans: Sequence[InputScan], drives: Drives | None, segmenter: Segmenter, progress: Progress
 ) -> Iterator[tuple[InputScan, Segmentation, np.ndarray, np.ndarray]]:
     """Yield each scan, its result, and the probabilities (N, K) and sights (N,) of its points."""
 
@@ -174,13 +163,7 @@ def _fused(
         yaw = 0.0 if drives is None else drives.yaws[key_of(scan)]
         return scan, loaded, segmenter(loaded.scan, yaw=yaw)
 
-    outcomes = stream_scans(
-        scans,
-        lambda scan: scan.load(),
-        segment,
-        segmenter.at_once,
-        progress,
-    )
+    outcomes = stream_scans(scans, lambda scan: scan.load(), segment, segmenter.at_once, progress)
     if drives is not None:
         for (scan, _, result), probabilities, sights in drives.consensus_of(outcomes):
             assert isinstance(result, Segmentation)
@@ -204,15 +187,10 @@ def adapt(
     """Teach both networks by the consensus of their own labels over drives.
 
     Args:
-        scans: the scans, those of each drive in order.
-        drives: their poses, or None if each scan teaches by its own labels.
-        weights: the weights that teach, and that the training begins with.
-        make_segmenter: returns the segmenter of some weights.
         make_plan: returns the plan of the training, given the scans with their labels.
         score: returns the mIoU of a segmenter on labelled scans, which decides whether the trained
             weights are better; by default, figures without labels do.
         request: the digest of all that the labels depend on (`digest_of`).
-        progress: returns a context that shows the progress of a step with a name.
 
     Returns:
         The path of the weights: the trained ones, or `weights` if they are not better.

@@ -44,7 +44,7 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
     if config.block_drop and rng.random() < config.block_drop:
         scan = _drop_blocks(scan, rng)
     if config.drop:
-        scan = _drop_points(scan, config.drop, rng)
+        scan = _keep(scan, rng.random(len(scan)) >= rng.uniform(0, config.drop))
 
     xyz = scan.points[:, :3] * (1 + rng.uniform(-config.scale, config.scale))
     mirrored = rng.random(2) < config.flip
@@ -176,14 +176,7 @@ def lasers(scan: Scan) -> np.ndarray:
     elevation = np.nan_to_num(_elevations(scan))
     lowest, highest = _spread(elevation)
     borders = np.linspace(lowest, highest, ELEVATION_BINS + 1)[1:-1]
-    laser: NDArray[np.intp] = np.searchsorted(borders, elevation, side="right")
-    return laser
-
-
-def _drop_points(scan: Scan, largest_share: float, rng: np.random.Generator) -> Scan:
-    """Drop a random share of the points, up to `largest_share`; keep all if none would be left."""
-    draws = rng.random(len(scan))
-    return _keep(scan, draws >= rng.uniform(0, largest_share))
+    return np.searchsorted(borders, elevation, side="right")
 
 
 def _drop_lasers(scan: Scan, rng: np.random.Generator) -> Scan:
@@ -241,14 +234,12 @@ def _distort_intensity(
 def _in_sector(scan: Scan, start: float, width: float) -> NDArray[np.bool_]:
     """Return (N,) bool: whether a point's azimuth is at most `width` radians beyond `start`."""
     azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
-    is_inside: NDArray[np.bool_] = (azimuth - start) % (2 * np.pi) < width
-    return is_inside
+    return (azimuth - start) % (2 * np.pi) < width
 
 
 def _elevations(scan: Scan) -> NDArray[np.floating]:
     x, y, z = scan.points[:, :3].T
-    elevation: NDArray[np.floating] = np.arctan2(z, np.hypot(x, y))
-    return elevation
+    return np.arctan2(z, np.hypot(x, y))
 
 
 def _spread(values: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -256,11 +247,11 @@ def _spread(values: NDArray[np.floating]) -> NDArray[np.floating]:
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
         return np.zeros(2)
-    ends: NDArray[np.floating] = np.percentile(finite, [OUTLIERS, 100 - OUTLIERS])
-    return ends
+    return np.percentile(finite, [OUTLIERS, 100 - OUTLIERS])
 
 
 def _keep(scan: Scan, mask: np.ndarray) -> Scan:
+    """Drop the points outside a mask (N,), unless none would be left."""
     return scan.select(mask) if mask.any() else scan
 
 

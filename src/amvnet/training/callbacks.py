@@ -124,10 +124,8 @@ class KeepWeights(Callback):
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         pl_module.check_epoch()
-        metrics = {}
-        for name, value in _metrics(trainer).items():
-            if name.startswith("val/"):
-                metrics[name] = value
+        found = _metrics(trainer)
+        metrics = {name: value for name, value in found.items() if name.startswith("val/")}
         metrics["epoch"] = trainer.current_epoch
 
         miou = metrics.get("val/miou") if pl_module.own_miou is None else pl_module.own_miou

@@ -34,7 +34,6 @@ class Checked:
     Attributes:
         weights: the weights to begin with: new ones, with the parts of `Plan.init`, and the parts
             that finished stages of the folder have trained.
-        expects: what the networks expect of a scan.
         class_counts: (K,) int64, the number of points of each class in the training scans of an
             epoch.
         taught: (M, K) bool, whether each of the M datasets teaches each class, as `rival_classes`

@@ -96,8 +96,7 @@ class HeadStage(Stage):
 def train_head(plan: Plan, weights: Weights) -> None:
     """Train the point head on scores of frozen networks, and write its weights after each epoch.
 
-    Args:
-        weights: the weights of both networks, and the head's weights to begin with, if any.
+    If `weights` have a head, the training begins with it.
 
     Raises:
         InputError: if a network is missing, or the scans have too few points for the head.

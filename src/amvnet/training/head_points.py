@@ -48,7 +48,6 @@ class HeadPoints:
 
     Attributes:
         paths: the files of the points, one for each process that scored scans.
-        dtype: the type of a point in the files.
         files: (U,) index of each point's file. The points of a file are in the same order here.
         labels: (U,) train ids of the points.
         certain: (K + 1, K + 1) confusion matrix of the ensemble over the certain points.
@@ -138,7 +137,6 @@ class PointGatherer:
     Attributes:
         plan: the plan of the run. All its processes must see the folder of the points. If it has
             the scores of two other models, these are used instead of the networks.
-        weights: the weights of the networks.
     """
 
     plan: Plan

@@ -43,14 +43,10 @@ PASTED_CLASSES = frozenset(
 
 
 class ScanSet(data.Dataset[Scan]):
-    """Labelled scans by epoch and index.
+    """Labelled scans by epoch and index, prepared for the networks and augmented if `augment`.
 
     The augmentation depends only on the seed, the epoch and the index, so that it is the same for
     any number of processes.
-
-    Args:
-        expects: what the networks expect of a scan, before its augmentation.
-        augment: how the scans are augmented, or None to leave them unchanged.
     """
 
     def __init__(

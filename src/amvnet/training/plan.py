@@ -33,14 +33,9 @@ class Plan:
     """One training run, as it is asked for. `Checked` is what its check finds.
 
     Attributes:
-        recipe: what to train.
         data: the scans to train on and to validate with. If there are no scans to validate with,
             the last weights are kept as the best.
-        out: the folder of the run.
-        init: the weights to begin with.
         stage: the stage to train, or "all" for the stages of the recipe.
-        resume: continue an earlier run in the same folder.
-        report: a function that prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
         processes: the processes that share the run. All of them must see its folder.
         scores: the scores of two other models for the scans. If they are given, the head learns
@@ -140,10 +135,9 @@ class Plan:
             recipe: what to train. Sizes and classes come from `init` if the recipe says so.
             specs: the datasets, as `open_dataset` takes them. The training scans of the second and
                 of later datasets are mixed in.
-            out: the folder of the run.
             choose: a function that returns the scans of the first dataset to train on and to
                 validate with.
-            init, stage, report, settings: attributes of the plan.
+            out, init, stage, report, settings: attributes of the plan.
 
         Raises:
             InputError: if a dataset cannot be opened or mixed in, the recipe needs `init`, or the
@@ -188,11 +182,7 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
 
 
 def without_initial_weights(
-    recipe: Recipe,
-    init: Weights | None,
-    classes: Taxonomy,
-    stages: Sequence[str],
-    report: Reporter,
+    recipe: Recipe, init: Weights | None, classes: Taxonomy, stages: Sequence[str], report: Reporter
 ) -> Recipe:
     """Return the recipe without averages and distillation of initial weights of other classes.
 
@@ -233,10 +223,6 @@ def open_for_training(
     A user's own scans are normalised as `predict` normalises them: to what the initial weights
     expect, or else to what the weights of an earlier call in `out` expect, or else to the sensor
     of the recipe.
-
-    Args:
-        stages: the stages to train.
-        report: takes a line about what is assumed of each of the first recordings.
 
     Raises:
         InputError: if the dataset cannot be opened (`open_dataset`).

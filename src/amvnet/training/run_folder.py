@@ -19,7 +19,7 @@ from amvnet.config.yaml_files import parse_yaml
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.open import is_dataset
 from amvnet.data.datasets.training_data import TrainingData
-from amvnet.errors import InputError
+from amvnet.errors import InputError, listed
 from amvnet.files import alone_in, atomic_write, remove_unfinished
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.outputs import check_not_read
@@ -253,13 +253,11 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         if key in settings:
             begun.setdefault(key, settings[key])
     if begun != settings:
-        changes = describe_changes(begun, settings)
-        others = len(changes) - MAX_CHANGES
-        more = f" and {others} more" if others > 0 else ""
+        changes = listed(describe_changes(begun, settings), MAX_CHANGES)
         raise InputError(
-            f"{folder}: expected the settings of the earlier run ({SETTINGS}), found "
-            f"{', '.join(changes[:MAX_CHANGES])}{more}; resume it with them, or train further "
-            f"from its weights in another folder: --init {folder.parent} --out FOLDER"
+            f"{folder}: expected the settings of the earlier run ({SETTINGS}), found {changes}; "
+            "resume it with them, or train further from its weights in another folder: "
+            f"--init {folder.parent} --out FOLDER"
         )
 
 

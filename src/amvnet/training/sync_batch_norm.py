@@ -16,8 +16,7 @@ def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
     The network is changed in place and returned. On GPUs, PyTorch's `SyncBatchNorm` is used.
     """
     if cuda:
-        synchronised: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(net)
-        return synchronised
+        return nn.SyncBatchNorm.convert_sync_batchnorm(net)
 
     for name, child in net.named_children():
         if isinstance(child, _BatchNorm):
@@ -92,5 +91,4 @@ class _ProcessSum(torch.autograd.Function):
 
 
 def _sum_over_processes(x: Tensor) -> Tensor:
-    total: Tensor = _ProcessSum.apply(x)  # type: ignore[no-untyped-call]
-    return total
+    return _ProcessSum.apply(x)  # type: ignore[no-untyped-call]

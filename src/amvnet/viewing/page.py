@@ -81,9 +81,7 @@ class Packed:
 
 
 def show(
-    shown: Segmentation | Scan | AnyArray,
-    path: Path | str | None = None,
-    open_browser: bool = True,
+    shown: Segmentation | Scan | AnyArray, path: Path | str | None = None, open_browser: bool = True
 ) -> Path:
     """Write a page that shows a scan in 3D, open it, and return its path.
 
@@ -153,10 +151,7 @@ def open_page(path: Path) -> None:
 def write_page(
     path: Path | str, scans: Iterable[ShownScan], taxonomy: Taxonomy, title: str
 ) -> Evaluation:
-    """Write one self-contained page with some scans; the file appears whole or not at all.
-
-    Args:
-        scans: the scans, in the order of the page's slider.
+    """Write one self-contained page with some scans in order; the file appears whole or not at all.
 
     Returns:
         The evaluation of all labels that have a ground truth; the page shows it as a table.
@@ -254,10 +249,12 @@ def fill_page(
         "TITLE": html.escape(title),
         "STYLE": style,
         "SCRIPT": script,
-        "ABOUT": _json(about),
+        # JSON that cannot close the HTML element that contains it.
+        "ABOUT": json.dumps(about, separators=(",", ":")).replace("<", "\\u003c"),
         "SCANS": scans,
     }
-    return _fill(_source("page.html"), parts)
+    # In one pass: an @@NAME@@ within a part stays unchanged.
+    return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], _source("page.html"))
 
 
 def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, Any]:
@@ -354,14 +351,12 @@ def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
 
 
 def _to_bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    scaled: NDArray[np.uint8] = np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
-    return scaled
+    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
 
 
 def _to_percent(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Map values in [0, 1] to 0..100, which deflate better than 0..255."""
-    scaled: NDArray[np.uint8] = np.round(np.clip(values, 0, 1) * 100).astype(np.uint8)
-    return scaled
+    return np.round(np.clip(values, 0, 1) * 100).astype(np.uint8)
 
 
 def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -389,8 +384,7 @@ def _ramp(name: str, start: float, end: float) -> list[list[int]]:
     from matplotlib import colormaps
 
     colors = colormaps[name](np.linspace(start, end, RAMP_STOPS))[:, :3]
-    ramp: list[list[int]] = (colors * 255).round().astype(int).tolist()
-    return ramp
+    return (colors * 255).round().astype(int).tolist()
 
 
 def _source(name: str) -> str:
@@ -402,16 +396,3 @@ def _hash(text: str) -> str:
     """Return the hash with which a content security policy allows this text and no other."""
     digest = hashlib.sha256(text.encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
-
-
-def _json(tree: Any) -> str:
-    """Return JSON that cannot close the HTML element that contains it."""
-    return json.dumps(tree, separators=(",", ":")).replace("<", "\\u003c")
-
-
-def _fill(template: str, parts: Mapping[str, str]) -> str:
-    """Replace each @@NAME@@ of a template by the part of that name.
-
-    The parts themselves are not searched: an @@NAME@@ within a part stays unchanged.
-    """
-    return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], template)

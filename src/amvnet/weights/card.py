@@ -80,10 +80,7 @@ def front_matter(weights: Weights, licence: str | None = None) -> str:
 
 def _summary(weights: Weights) -> str:
     sensor = f" of the sensor {weights.sensor}" if weights.sensor else ""
-    parts = []
-    for part in weights.parts:
-        parts.append(f"{TITLES[part].lower()} (`{part}`)")
-
+    parts = [f"{TITLES[part].lower()} (`{part}`)" for part in weights.parts]
     return (
         f"LiDAR semantic segmentation (AMVNet, arXiv 2012.04934) for scans{sensor}. "
         f"In this file: {', '.join(parts) or 'nothing'}."

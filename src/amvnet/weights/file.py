@@ -63,7 +63,6 @@ class Weights:
 
     Attributes:
         model: sizes of the views, networks and head.
-        taxonomy: the classes.
         sensor: name of the sensor that they were trained for; "" if unknown.
         expects: what the networks expect of a scan; its view is that of `model`.
         tensors: the parameters by name; each name begins with its part: "range_net.",
@@ -131,12 +130,8 @@ class Weights:
     def part(self, name: str) -> dict[str, Tensor]:
         """Return the parameters of one part, named as in the part's own module."""
         prefix = f"{name}."
-        state = {}
-        for key, tensor in self.tensors.items():
-            if key.startswith(prefix):
-                state[key.removeprefix(prefix)] = tensor
-
-        return state
+        own = [key for key in self.tensors if key.startswith(prefix)]
+        return {key.removeprefix(prefix): self.tensors[key] for key in own}
 
     def digest(self, name: str) -> str:
         """Return 16 hexadecimal digits that identify the parameters of one part."""
@@ -347,10 +342,7 @@ def _read_tensors(file: Any, weights: Weights) -> dict[str, Tensor]:
 def built_in() -> dict[str, Path]:
     """Return the paths of the weights files that come with the package, by name."""
     folder = Path(str(resources.files("amvnet"))) / "pretrained"
-    paths = {}
-    for path in sorted(folder.glob("*.safetensors")):
-        paths[path.stem] = path
-    return paths
+    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
 
 
 def list_weights() -> list[str]:

@@ -46,13 +46,9 @@ def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
             f"{difference}; train this part for these classes, in another folder"
         )
 
-    tensors = {}
-    for key, tensor in weights.tensors.items():
-        if not key.startswith(f"{part}."):
-            tensors[key] = tensor
-    for key, tensor in other.part(part).items():
-        tensors[f"{part}.{key}"] = tensor
-
+    prefix = f"{part}."
+    tensors = {key: weights.tensors[key] for key in weights.tensors if not key.startswith(prefix)}
+    tensors |= {key: other.tensors[key] for key in other.tensors if key.startswith(prefix)}
     return dataclasses.replace(
         resized(weights, part, other.model),
         expects=other.expects,

@@ -187,16 +187,12 @@ def test_a_cache_that_another_user_can_write_is_not_used_and_that_is_said(
             assert "AMVNET_CACHE" in said
             assert networks[RANGE_NET] == b"range_net another graph"
             assert exports.count == count
-            assert cached_folder_is_none()
+            assert cached_networks(WEIGHTS).folder is None
             exports.count -= 1
         assert {n: (user_cache() / n).read_bytes() for n in stored} == stored
     finally:
         changed.chmod(before)
     assert cached()[1] == ""
-
-
-def cached_folder_is_none() -> bool:
-    return cached_networks(WEIGHTS).folder is None
 
 
 def test_a_folder_in_which_only_owners_can_rename_may_hold_the_cache(

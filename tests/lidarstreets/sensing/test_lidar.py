@@ -313,10 +313,7 @@ def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(
 ) -> None:
     """A rotation is centred on ahead: the sensor looks left a quarter of it later, or earlier."""
     sensor = replace(
-        EXACT,
-        rotation_period=0.1,
-        motion_corrected=corrected,
-        counter_clockwise=counter_clockwise,
+        EXACT, rotation_period=0.1, motion_corrected=corrected, counter_clockwise=counter_clockwise
     )
     left_wall = replace(wall(10), triangles=wall(10).triangles[..., [1, 0, 2]])
     pole = part([box((0.2, 0.2, 20), (0, 10, -10))], Surface.METAL, Label.POLE)

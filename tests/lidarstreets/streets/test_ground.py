@@ -96,10 +96,7 @@ def test_side_roads_are_roads(ground: Ground) -> None:
             assert road.distance(np.array([x]), np.array([y]))[0] == pytest.approx(
                 -road.width / 2, abs=0.3
             )
-            assert ground.label(np.array([x]), np.array([y]))[0] in (
-                Label.ROAD,
-                Label.LANE_MARKING,
-            )
+            assert ground.label(np.array([x]), np.array([y]))[0] in (Label.ROAD, Label.LANE_MARKING)
 
 
 def test_islands_have_their_class(ground: Ground) -> None:

@@ -12,12 +12,7 @@ TABLE = "ablation"  # name of the table's file, without its ending
 
 
 def ablate(
-    recipe: Recipe,
-    /,
-    data: str,
-    out: Path,
-    choice: TrainingChoice,
-    device: str = "auto",
+    recipe: Recipe, /, data: str, out: Path, choice: TrainingChoice, device: str = "auto"
 ) -> None:
     """Train the range-view network with and without GRU and class weights: the paper's Table 5.
 

@@ -113,13 +113,7 @@ def evaluate(
     processes.wait()
     with progress("scoring") as step:
         evaluation = evaluate_records(
-            dataset,
-            records,
-            labeller,
-            pictures,
-            progress=step,
-            processes=processes,
-            drives=drives,
+            dataset, records, labeller, pictures, progress=step, processes=processes, drives=drives
         )
     if processes.first:
         show_evaluation(evaluation, data, json, tau)
@@ -166,7 +160,6 @@ def show_evaluation(
 
     Args:
         dataset: the name of the dataset, for the title.
-        path: the file to write, or None to write none.
         tau: the threshold of the assertion if the user chose it.
     """
     from amvnet.cli.tables import evaluation_table

@@ -51,7 +51,6 @@ class Dataset(ABC):
     """One dataset on disk; instances can be pickled, so that worker processes can read.
 
     Attributes:
-        taxonomy: the classes of the labels.
         spec: the text by which `open_dataset` opens the same dataset; by default the folder.
         readers: number of threads that may read scans at the same time.
         simulated_sensor: the sensor whose scans are simulated, new ones in each epoch; "" if the
@@ -208,10 +207,7 @@ class Dataset(ABC):
 
     @abstractmethod
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
-        """Read the (N,) raw ids of a scan that has labels, with whatever values.
-
-        Args:
-            count: N, the number of points.
+        """Read the (N,) raw ids of a scan that has labels and N = `count` points, unchecked.
 
         Raises:
             InputError: if the file is missing, broken or has another number of labels.

@@ -63,7 +63,6 @@ class Description:
 
     Attributes:
         root: the folder that all other paths are relative to.
-        labels: where the labels are; None if there are none.
         unread: the classes of the labels, if they are not the classes in `taxonomy`. Such labels
             are not read.
         poses: the file of the poses of all scans in a folder, relative to this folder; empty if

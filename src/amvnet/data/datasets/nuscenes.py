@@ -63,9 +63,8 @@ class NuScenes(Dataset):
         version: "v1.0-mini", "v1.0-trainval" or "v1.0-test".
 
     Raises:
-        InputError: if `root` does not have this layout.
-        InputError: if `root` has several versions, and `version` is not given.
-        InputError: if a table is missing or broken.
+        InputError: if `root` does not have this layout, or has several versions and `version` is
+            not given, or a table is missing or broken.
     """
 
     def __init__(self, root: Path | str, version: str | None = None) -> None:
@@ -74,7 +73,7 @@ class NuScenes(Dataset):
 
         with self._using_tables():
             label_rows = self._table("lidarseg", required=False)
-            self._label_files = _lookup(label_rows, "sample_data_token", "filename")
+            self._label_files = {row["sample_data_token"]: row["filename"] for row in label_rows}
             self._category_train_ids = self._category_lookup() if label_rows else None
             self._records_by_scene = self._read_records()
 
@@ -302,12 +301,11 @@ class NuScenes(Dataset):
                 "use the tables that came with the labels"
             )
 
-        checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
-        return checked
+        return train_ids.astype(np.uint8)
 
     def _read_records(self) -> dict[str, list[ScanRecord]]:
         """Read the tables; return the scans of every scene, by its name, in order of time."""
-        scene_names = _lookup(self._table("scene"), "token", "name")
+        scene_names = {row["token"]: row["name"] for row in self._table("scene")}
         scene_of_sample = {}
         for row in self._table("sample"):
             scene_of_sample[row["token"]] = checked_token(scene_names[row["scene_token"]])
@@ -350,8 +348,3 @@ class NuScenes(Dataset):
 
 def _is_scan(row: Row) -> bool:
     return bool(row["is_key_frame"]) and str(row["filename"]).startswith(f"samples/{CHANNEL}/")
-
-
-def _lookup(rows: list[Row], key: str, value: str) -> dict[str, Any]:
-    """Return a dictionary from the values in one column to the values in another."""
-    return {row[key]: row[value] for row in rows}

@@ -12,13 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, Normalise, ScanRecord
-from amvnet.data.datasets.description import (
-    SPLITS,
-    WILDCARDS,
-    Description,
-    below,
-    read_description,
-)
+from amvnet.data.datasets.description import SPLITS, WILDCARDS, Description, below, read_description
 from amvnet.data.formats.find import ANY_FOLDERS, NamedScan, list_scans, matching, scan_stem
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_raw_labels
@@ -35,11 +29,7 @@ class OwnScans(Dataset):
     the split cuts through a folder, its parts are sequences: `site-train`, `site-val`.
     """
 
-    def __init__(
-        self,
-        description: Description,
-        normalise: Normalise | None = None,
-    ) -> None:
+    def __init__(self, description: Description, normalise: Normalise | None = None) -> None:
         super().__init__(description.root, description.taxonomy, str(description.path))
         self.description = description
         self.described_sensor = description.sensor

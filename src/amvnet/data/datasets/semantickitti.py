@@ -18,10 +18,9 @@ from amvnet.scan import Scan
 
 
 class SemanticKitti(Dataset):
-    """A SemanticKITTI dataset. `Dataset` documents the arguments and errors of its methods.
+    """A SemanticKITTI dataset in a folder that holds `sequences/`, or in `sequences` itself.
 
-    Args:
-        root: the folder that holds `sequences/`, or `sequences` itself.
+    `Dataset` documents the arguments and errors of its methods.
 
     Raises:
         InputError: if `root` does not have this layout.
@@ -115,10 +114,7 @@ class SemanticKitti(Dataset):
         return inner if inner.is_dir() else self.root
 
     def _sequences_on_disk(self) -> tuple[str, ...]:
-        names = []
-        for path in self._folder.glob("*/velodyne"):
-            names.append(path.parent.name)
-        return tuple(sorted(names))
+        return tuple(sorted(path.parent.name for path in self._folder.glob("*/velodyne")))
 
     def _records(self, sequence: str) -> list[ScanRecord]:
         folder = self._folder / sequence

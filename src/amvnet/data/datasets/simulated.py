@@ -54,7 +54,6 @@ class SimulatedStreets(Dataset):
 
     Args:
         root: the folder of the cache, which is made if it does not exist.
-        sensor: the name of a sensor in `CLASSES_BY_SENSOR`.
     """
 
     readers = 1  # two threads would simulate the same street
@@ -72,11 +71,7 @@ class SimulatedStreets(Dataset):
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these streets, in order."""
         numbers = {self._number(sequence) for sequence in sequences}
-        records = []
-        for number in sorted(numbers):
-            for index in range(SCANS):
-                records.append(self._record(number, index))
-        return records
+        return [self._record(number, index) for number in sorted(numbers) for index in range(SCANS)]
 
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
         """Return the same scan of the epoch's street; streets to validate with do not change."""

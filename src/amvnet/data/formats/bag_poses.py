@@ -18,8 +18,8 @@ from amvnet.data.formats.bags import (
     LISTED_TOPICS,
     TF_TYPE,
     Bag,
+    deserialiser,
     open_reader,
-    types_of,
 )
 from amvnet.data.formats.cloud import reading
 from amvnet.data.formats.reader_process import call
@@ -42,8 +42,6 @@ class BagPoses:
     """The poses of the LiDAR at the time stamps of the scans in a bag.
 
     Attributes:
-        path: the file, or the folder of a ROS 2 bag.
-        ending: the storage format, as for `Bag`.
         scan_topic: the topic of the scans; None for the only one.
     """
 
@@ -53,8 +51,7 @@ class BagPoses:
 
     def times(self) -> list[float]:
         """Return the time stamps of the scans in seconds; raise InputError if one is broken."""
-        times: list[float] = self._call(read_times, self.scan_topic)["times"].tolist()
-        return times
+        return self._call(read_times, self.scan_topic)["times"].tolist()
 
     def odometry(self) -> str | None:
         """Return the first topic with odometry, or None if there is none."""
@@ -91,8 +88,7 @@ class BagPoses:
         return _by_odometry(name, transforms, found["frame"], found["times"], report)
 
     def _topics(self) -> dict[str, str]:
-        topics: dict[str, str] = self._call(pose_topics)["topics"]
-        return topics
+        return self._call(pose_topics)["topics"]
 
     def _call(self, function: Any, *arguments: Any) -> dict[str, Any]:
         with readable(self.path):
@@ -173,8 +169,7 @@ def _by_odometry(
             f"{shown(odometry.child)} to the scans' frame {shown(frame)}"
         )
         return poses
-    moved: Poses = poses @ np.linalg.inv(of_child[common]) @ of_lidar[common]
-    return moved
+    return poses @ np.linalg.inv(of_child[common]) @ of_lidar[common]
 
 
 def _climb(
@@ -213,23 +208,17 @@ def read_transforms(path: Path, ending: str, scan_topic: str | None, topic: str)
     into the `frames`: parent, child, and whether the transform is static.
     """
     times, frame = Bag(path, ending, scan_topic).headers()
-    is_ros1 = ending == ".bag"
-    types = types_of(is_ros1)
-    deserialise = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
+    deserialise = deserialiser(ending == ".bag")
     frames: dict[tuple[str, str, bool], int] = {}
     edges = array("q")
     rows = array("d")
     with reading(f"{path} ({topic})", EXPECTED, ADVICE), closing(open_reader(path, ending)) as bag:
-        chosen = []
-        for connection in _with_poses(bag.connections):
-            is_static = connection.msgtype in TF_TYPES and connection.topic.endswith(STATIC)
-            if connection.topic == topic or is_static:
-                chosen.append(connection)
+        connections = _with_poses(bag.connections)
+        chosen = [each for each in connections if each.topic == topic or _is_static(each)]
         for connection, _, data in bag.messages(connections=chosen):
-            is_static = connection.msgtype in TF_TYPES and connection.topic.endswith(STATIC)
             kind = TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
             for parent, child, *row in _poses_of(deserialise(data, kind)):
-                key = (parent.strip("/"), child.strip("/"), is_static)
+                key = (parent.strip("/"), child.strip("/"), _is_static(connection))
                 edges.append(frames.setdefault(key, len(frames)))
                 rows.extend(row)
     return {
@@ -243,6 +232,10 @@ def read_transforms(path: Path, ending: str, scan_topic: str | None, topic: str)
 
 def _with_poses(connections: Iterable[Any]) -> list[Any]:
     return [connection for connection in connections if connection.msgtype in POSE_TYPES]
+
+
+def _is_static(connection: Any) -> bool:
+    return connection.msgtype in TF_TYPES and connection.topic.endswith(STATIC)
 
 
 def _poses_of(message: Any) -> Iterator[tuple[Any, ...]]:

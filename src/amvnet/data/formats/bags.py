@@ -118,11 +118,7 @@ class Bag:
                 yield data
 
     def _decode(self, data: bytes, name: str) -> Cloud:
-        # A ROS 2 bag serialises in the same way in every storage format.
-        is_ros1 = self._ending == ".bag"
-        types = types_of(is_ros1)
-        deserialise = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-        return read_message(deserialise(data, CLOUD_TYPE), name)
+        return read_message(deserialiser(self._ending == ".bag")(data, CLOUD_TYPE), name)
 
 
 def open_reader(path: Path, ending: str) -> Any:
@@ -173,15 +169,15 @@ def _check_unpacked(folder: Path) -> None:
 
 
 @cache
-def types_of(is_ros1: bool) -> Any:
-    """Return rosbags' store of the message types of ROS 1 or ROS 2."""
+def deserialiser(is_ros1: bool) -> Callable[[bytes, str], Any]:
+    """Return rosbags' function that reads a message of ROS 1 or ROS 2, given its bytes and type."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    if not is_ros1:
-        return get_typestore(Stores.ROS2_HUMBLE)
+    if not is_ros1:  # alike in every storage format
+        return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
     types = get_typestore(Stores.ROS1_NOETIC)  # has no package tf2_msgs
     types.register(get_types_from_msg(TF_DEFINITION, TF_TYPE))
-    return types
+    return types.deserialize_ros1
 
 
 def _with_scans(connections: Iterable[Any]) -> list[Any]:

@@ -173,7 +173,6 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
     """Return the number of points that a header claims, if it is plausible.
 
     Args:
-        path: the file, for the message and for its size.
         least: the smallest size of a file with so many points, bytes; 0 if it is not known.
 
     Raises:
@@ -202,7 +201,6 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
     Readers raise all kinds of exceptions on broken bytes. An InputError passes unchanged.
 
     Args:
-        path: the beginning of the message.
         expected: what was expected in the file, such as "a PCD file".
 
     Raises:
@@ -236,10 +234,8 @@ def require_columns(
     """Find columns as `find_columns` does; raise InputError if a needed column is missing."""
     columns = find_columns(names, wanted)
     if not set(wanted) <= {*columns, *OPTIONAL}:
-        expected = []
-        for key, aliases in wanted.items():
-            if key not in OPTIONAL:
-                expected.append(" or ".join(aliases))
+        needed = [aliases for key, aliases in wanted.items() if key not in OPTIONAL]
+        expected = map(" or ".join, needed)
         listing = ", ".join(names[:20]) or "none"
         raise InputError(
             f"{path}: expected columns {', '.join(expected)}, found {listing[:200]!a}; "

@@ -86,10 +86,7 @@ def find_scans(path: Path | str) -> list[Path]:
 
 
 def list_scans(
-    path: Path | str,
-    topic: str | None = None,
-    layout: RowLayout = UNKNOWN,
-    is_alone: bool = True,
+    path: Path | str, topic: str | None = None, layout: RowLayout = UNKNOWN, is_alone: bool = True
 ) -> Iterator[NamedScan]:
     """Yield the scans of the files that `find_scans` finds. A bag's scans keep their order.
 

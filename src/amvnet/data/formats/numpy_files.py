@@ -43,9 +43,6 @@ ARCHIVE_ADVICE = "save it again with np.savez"
 def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read the points of an array file.
 
-    Args:
-        layout: the names of the columns, if the user states them.
-
     Raises:
         InputError: if the file holds no array of numbers, has an unsuitable shape or is truncated.
     """

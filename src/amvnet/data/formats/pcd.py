@@ -84,9 +84,8 @@ def _read_header(file: BinaryIO, path: Path) -> dict[str, list[str]]:
 def _parse_fields(entries: dict[str, list[str]]) -> Fields:
     """Return the fields that the lines FIELDS, SIZE, TYPE and COUNT describe."""
     names = entries.get("FIELDS") or entries["COLUMNS"]
-    dtypes = []
-    for kind, size in zip(entries["TYPE"], entries["SIZE"], strict=True):
-        dtypes.append(TYPES[kind.upper()][int(size)])
+    kinds = zip(entries["TYPE"], entries["SIZE"], strict=True)
+    dtypes = [TYPES[kind.upper()][int(size)] for kind, size in kinds]
     counts = list(map(int, entries.get("COUNT", ["1"] * len(names))))
     if not len(names) == len(dtypes) == len(counts) or min(counts) < 0:
         raise ValueError(f"{len(names)} FIELDS, {len(dtypes)} TYPE, COUNT {counts[:20]}")

@@ -69,7 +69,7 @@ def _explain(data: np.ndarray, layout: RowLayout) -> tuple[str, str]:
     if len(data) % kitti and len(data) % nuscenes:
         found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
         advice = f"copy the file again if it is truncated, or {advice}"
-    elif _are_lost(data):
+    elif not np.isfinite(data.view(np.float32)).any():
         return "no finite number", "record the scan again"
 
     if len(data) % kitti == 0 and _are_millimetres(data):
@@ -161,11 +161,6 @@ def _are_millimetres(data: np.ndarray) -> bool:
     return _is_kitti(_kitti_table(data) * IN_METRES)
 
 
-def _are_lost(data: np.ndarray) -> bool:
-    """Return whether a file holds no finite float32; its size is a multiple of 4 bytes."""
-    return not np.isfinite(data.view(np.float32)).any()
-
-
 def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     """Return whether values (N, 5) can be x, y, z, intensity and ring.
 
@@ -203,13 +198,11 @@ def _are_near(
     """Return (N,) bool: whether a point is lost, or within the usual reach of a sensor."""
     is_lost = ~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
     is_near = (np.abs(x) < NEAR) & (np.abs(y) < NEAR) & (np.abs(z) < NEAR)
-    is_either: NDArray[np.bool_] = is_lost | is_near
-    return is_either
+    return is_lost | is_near
 
 
 def _are_intensities(values: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (N,) bool: whether a value can be an intensity, also of a lost point."""
     is_possible = (values >= 0) & (values <= MAX_INTENSITY)
     is_missing = (values == NO_INTENSITY) | ~np.isfinite(values)
-    is_intensity: NDArray[np.bool_] = is_possible | is_missing
-    return is_intensity
+    return is_possible | is_missing

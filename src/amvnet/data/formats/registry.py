@@ -59,22 +59,17 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     if ending == GZIP:
         return Cloud(**_call(read_gzip, path, ending, list(layout.columns), list(layout.dtypes)))
     if ending in ROW_READERS:
-        cloud: Cloud = _call(ROW_READERS[ending], path, ending, layout)
-        return cloud
+        return _call(ROW_READERS[ending], path, ending, layout)
     return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
 
 
 def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     """Read some columns of a file of points; each has one number per point, in any shape.
 
-    Args:
-        ending: the ending of its format, one of `COLUMN_READERS`.
-
     Raises:
         InputError: if the file is broken, lacks a column, or needs a package that is missing.
     """
-    columns: Arrays = _call(COLUMN_READERS[ending], path, ending, wanted)
-    return columns
+    return _call(COLUMN_READERS[ending], path, ending, wanted)
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
@@ -86,10 +81,8 @@ def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cl
         InputError: if the bag is broken, has no scan, or needs a package that is missing.
     """
     bag = (ending, topic, uuid4().hex)  # the arguments of `_open`
-    readers: list[Callable[[], Cloud]] = []
-    for index in range(_call(count_scans, path, ending, *bag)["count"]):
-        readers.append(partial(_read_scan, path, bag, index))
-    return readers
+    count = _call(count_scans, path, ending, *bag)["count"]
+    return [partial(_read_scan, path, bag, index) for index in range(count)]
 
 
 def _read_scan(path: Path, bag: tuple[str, str | None, str], index: int) -> Cloud:

@@ -48,7 +48,6 @@ class TextTable:
     Attributes:
         separator: the text between the values of a line; None for white space.
         skipped: the number of lines before the first point.
-        count: the number of columns.
         names: the names of the columns; empty if the file has none.
     """
 

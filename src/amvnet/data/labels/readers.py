@@ -40,12 +40,7 @@ def read_scan_labels(path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
 
 
 def read_raw_labels(
-    path: Path,
-    count: int,
-    field: str | None = None,
-    layout: RowLayout = UNKNOWN,
-    *,
-    missing: int,
+    path: Path, count: int, field: str | None = None, layout: RowLayout = UNKNOWN, *, missing: int
 ) -> np.ndarray:
     """Read (N,) int64 raw ids from a label file, or from a field of the scan's file.
 
@@ -55,7 +50,6 @@ def read_raw_labels(
 
     Args:
         path: a label file, or with a field, the scan's file.
-        count: N, the number of points of the scan.
         field: the name of the column. In `.npz`, it may also name an array next to the points. In
             arrays and text without names, it is the number of the column, from 0.
         missing: the raw id for NaN, which CloudCompare writes for points without a label.

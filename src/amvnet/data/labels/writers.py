@@ -75,11 +75,9 @@ def write_scan_labels(
 
     Args:
         stem: the path without an ending; `.` and the kind are added.
-        kind: the format, one of `KINDS`.
         xyz: (N, 3) the unchanged coordinates of the scan's file, metres. `label` and `npy` use
             only N.
         ids: (N,) train ids in 0..K.
-        taxonomy: turns train ids into raw ids and colours.
         uncertain: (N,) bool; by default, the column is left out.
 
     Raises:

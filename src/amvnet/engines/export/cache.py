@@ -45,11 +45,6 @@ def cached_networks(
     that cannot be written is not filled: the networks are exported for this process alone. Several
     processes may use the cache at the same time.
 
-    Args:
-        weights: trained weights.
-        int8: whether the convolutions are in int8, calibrated with simulated streets.
-        report: called with a line before long work.
-
     Raises:
         InputError: if `export` or `simulated_scans` raises it.
     """
@@ -184,9 +179,11 @@ def shared_with_others(folder: Path) -> Path | None:
     for path in (*files, folder, folder.parent, root, root.resolve()):
         if path.exists() and not (_is_own(path.stat()) and _is_own(path.lstat())):
             return path
-    # A user who can rename a folder can put another folder in its place.
+    # A user who can rename a folder can put another folder in its place. In a sticky one, such as
+    # /tmp, only owners can.
     for path in (*root.absolute().parents, *root.resolve().parents):
-        if path.exists() and _can_others_write(path.stat()) and not _is_sticky(path.stat()):
+        is_sticky = path.exists() and path.stat().st_mode & stat.S_ISVTX
+        if path.exists() and _can_others_write(path.stat()) and not is_sticky:
             return path
     return None
 
@@ -202,11 +199,6 @@ def _can_others_write(status: os.stat_result) -> bool:
     """Return whether the mode of a file lets users other than its owner write."""
     by_group = status.st_mode & stat.S_IWGRP and not _is_group_of_one(status.st_gid)
     return bool(status.st_mode & stat.S_IWOTH or by_group)
-
-
-def _is_sticky(status: os.stat_result) -> bool:
-    """Return whether only owners can rename files in a folder, as in /tmp."""
-    return bool(status.st_mode & stat.S_ISVTX)
 
 
 def _is_group_of_one(gid: int) -> bool:

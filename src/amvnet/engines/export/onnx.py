@@ -56,9 +56,6 @@ class Graph:
     """One part of the method, to be exported.
 
     Attributes:
-        module: the part in torch.
-        inputs: an example of each input, by name.
-        output: the output's name.
         compared: turns outputs into the values that are compared with torch: probabilities, or
             features that `_shares` has scaled.
     """
@@ -91,7 +88,6 @@ def export(
 
     Args:
         weights: trained weights, or the name or path of a weights file.
-        progress: called with the number of graphs that are done, and their total.
         scans: convert the convolutions to int8, calibrated with these scans, which are prepared for
             the networks (`calibration_scans`). Without scans, the graphs are in float32.
 
@@ -131,11 +127,7 @@ def possible_files(out: Path) -> dict[Path, Signature]:
 
 
 def _write_all(
-    weights: Weights,
-    method: MethodName,
-    scans: Sequence[Scan],
-    folder: Path,
-    progress: Progress,
+    weights: Weights, method: MethodName, scans: Sequence[Scan], folder: Path, progress: Progress
 ) -> dict[str, Any]:
     """Write the graphs of a method, in int8 if there are scans; return what `amvnet.json` says."""
     written: dict[str, dict[str, Any]] = {}

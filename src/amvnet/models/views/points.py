@@ -51,7 +51,6 @@ class PointBatch:
             scan has rings.
         row: (P,) int64 rows of the range image: 0 is the top, -1 is unknown. None if no scan has
             rows.
-        names: the names of the scans.
         sizes: the number of points of each scan. If it is empty, the points have to be counted, and
             for this the CPU waits for a GPU.
     """
