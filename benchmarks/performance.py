@@ -56,7 +56,7 @@ def without_convolved_rows() -> None:
 
 
 def without_pykdtree() -> None:
-    sys.modules["pykdtree.kdtree"] = None
+    sys.modules["pykdtree.kdtree"] = None  # type: ignore[assignment]
 
 
 def without_occupied_pillars() -> None:

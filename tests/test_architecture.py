@@ -56,6 +56,7 @@ def imported(node: ast.AST) -> Iterator[str]:
 def levels() -> dict[str, int]:
     """Return the level of each package in the drawing of the page; 0 is the lowest."""
     drawing = re.search(r"## Import direction.*?```text\n(.*?)```", PAGE, re.S)
+    assert drawing is not None
     heights = {}
     for level, line in enumerate(reversed(drawing[1].splitlines())):
         for name in line.split():
@@ -108,6 +109,7 @@ def test_the_simulator_knows_nothing_of_the_method() -> None:
 
 def test_the_page_lists_all_packages() -> None:
     table = re.search(r"## Packages\n(.*?)\n\nNext to", PAGE, re.S)
+    assert table is not None
     rows = re.findall(r"^\| (.+?) \| (.+) \|$", table[1], re.M)[1:]
     packages = {name.strip("`") for name, _ in rows[:-1]}
     singles = set(re.findall(r"`(\w+)`", rows[-1][1]))

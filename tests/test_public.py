@@ -137,6 +137,7 @@ def test_a_scan_of_a_dataset_keeps_its_labels(tmp_path: Path, segmenter: Segment
     data = make_streets(tmp_path, ("00",))
     fails(lambda: segmenter(data), "a dataset", "Segmenter.each")
     first = next(segmenter.each(data))
+    assert first.origin is not None
     assert first.origin.scan.labels is not None
     assert first.assumed == ""
 
@@ -233,6 +234,7 @@ def test_show_writes_a_page_and_opens_it(
     np.testing.assert_array_equal(planes["truth"], SEMANTICKITTI.to_train(raw)[is_valid])
     np.testing.assert_array_equal(planes["uncertain"], result.uncertain[is_valid])
     for name, scores in (("rv", result.rv), ("bev", result.bev)):
+        assert scores is not None
         np.testing.assert_array_equal(planes[name], scores[is_valid].argmax(axis=1) + 1)
 
 

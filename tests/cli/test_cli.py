@@ -235,6 +235,7 @@ def test_scores_are_both_networks_probabilities_in_half_precision(
     with np.load(tmp_path / folder / "000000.npz", allow_pickle=False) as arrays:
         assert set(arrays.files) == {"rv", "bev"}
         for name, probabilities in (("rv", result.rv), ("bev", result.bev)):
+            assert probabilities is not None
             assert arrays[name].dtype == np.float16
             assert arrays[name].shape == (500, 19)
             assert np.array_equal(arrays[name], probabilities.astype(np.float16))

@@ -63,7 +63,7 @@ def test_a_step_has_ten_lines_at_most_and_none_at_the_beginning(
 def test_a_line_has_the_pace_and_the_time_left(lines_at: LinesAt) -> None:
     texts = [text for _, text in lines_at(10, 100)]
     assert texts[0] == "segmenting: 10 of 100, 10 s each, 0:15:00 left"
-    done = [int(re.fullmatch(PROGRESS_LINE, text)[1]) for text in texts]
+    done = [int(re.fullmatch(PROGRESS_LINE, text)[1]) for text in texts]  # type: ignore[index]
     assert done == list(range(10, 101, 10))
     assert "2 a second" in lines_at(0.5, 100)[0][1]
 

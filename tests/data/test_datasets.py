@@ -65,6 +65,7 @@ def test_a_scan_has_points_labels_and_intensity_in_unit_range(layout: Layout) ->
 
     assert scan.points.dtype == np.float32
     assert scan.points[:, 3].tolist() == pytest.approx(layout.intensity)
+    assert scan.labels is not None
     assert scan.labels.dtype == np.uint8
     assert scan.labels.tolist() == layout.truth
     assert scan.ring is None or scan.ring.tolist() == list(range(7))

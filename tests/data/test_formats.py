@@ -559,6 +559,7 @@ def test_a_dimension_of_las_with_rings_is_read(tmp_path: Path) -> None:
     las.write(str(tmp_path / "a.las"))
 
     ring = read_cloud(tmp_path / "a.las").ring
+    assert ring is not None
     assert ring.tolist() == list(np.arange(60) % 16)
 
 

@@ -32,6 +32,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def process_id() -> int:
+    assert reader_process._process is not None
     return reader_process._process._popen.pid
 
 
@@ -126,6 +127,8 @@ def test_the_process_ends_with_the_one_that_started_it(tmp_path: Path, ends: str
         stdout=subprocess.PIPE,
         text=True,
     ) as parent:
+        assert parent.stdin is not None
+        assert parent.stdout is not None
         number, folder = parent.stdout.readline().split()
         if ends == "by SIGKILL":
             parent.kill()

@@ -68,6 +68,8 @@ def test_a_scan_equals_that_of_the_files_of_a_simulation(
         other = written.read(written_record)
         assert np.array_equal(scan.points, other.points)
         assert scan.points.dtype == other.points.dtype
+        assert scan.labels is not None
+        assert other.labels is not None
         assert np.array_equal(scan.labels, other.labels)
         assert scan.labels.dtype == other.labels.dtype
         if other.ring is None:
@@ -75,6 +77,8 @@ def test_a_scan_equals_that_of_the_files_of_a_simulation(
                 continue
             # The order of the points in the files of SemanticKITTI tells their rings.
             other = replace(other, ring=lasers_by_order(other.points, 64))
+        assert scan.ring is not None
+        assert other.ring is not None
         assert np.array_equal(scan.ring, other.ring)
         assert scan.ring.dtype == other.ring.dtype
 

@@ -79,6 +79,7 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
     g = voxels[grid.voxel, :, grid.occupied[grid.slot]].softmax(dim=1)
 
     head = model.point_head
+    assert head is not None
     index = model.assertion(f, g, batch.points).nonzero()[:, 0]
     n = head.config.neighbours
     near = torch.from_numpy(nearest_by_scipy(batch.points[:, :3].numpy(), index.numpy(), n))

@@ -237,6 +237,7 @@ def test_the_table_says_what_the_scans_hold(world: Path) -> None:
     names = ("", *SEMANTICKITTI.classes)
     for row in clusters[:20]:
         scan = dataset.read(records[row["scan"]])
+        assert scan.labels is not None
         point = int(row["point"])
         xyz = (float(row["x"]), float(row["y"]), float(row["z"]))
         assert np.allclose(xyz, scan.points[point, :3], atol=0.006)

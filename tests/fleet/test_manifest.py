@@ -281,6 +281,7 @@ def test_the_memory_of_planning_does_not_grow_with_the_names(
             snapshot = tracemalloc.take_snapshot() if len(names) == drives * DRIVE else None
         tracemalloc.stop()
         # Python enlarges its table of interned strings at times that differ.
+        assert snapshot is not None
         own = snapshot.filter_traces([tracemalloc.Filter(False, "*/pathlib.py")])
         return sum(trace.size for trace in own.traces)
 

@@ -166,7 +166,7 @@ GOOD = rows("ab")
         ("part-000000.parquet", written(GOOD.drop_columns(["error"])), ("the columns",)),
         ("part-000000.parquet", written(GOOD.drop_columns(["scan"])), ("the columns",)),
         ("part-000000.parquet", written(pa.table({"x": [1]})), ("the columns x",)),
-        ("part-000000.parquet", written(rows([None])), ("a row without scan",)),
+        ("part-000000.parquet", written(rows([None])), ("a row without scan",)),  # type: ignore[list-item]
         (
             "part-000000.parquet",
             written(GOOD.set_column(11, "weights", pa.array([[1], [2]]))),

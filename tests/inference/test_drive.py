@@ -244,6 +244,7 @@ def test_poses_of_ones_own_scans_move_the_points_of_their_files(
         np.testing.assert_allclose(found, points[:, :3] @ pose[:3, :3].T + pose[:3, 3], atol=1e-3)
 
     part = scans[5].poses(scans[5:7])
+    assert part is not None
     np.testing.assert_allclose(part[:, :3].reshape(-1, 12), kitti[5:7], atol=1e-12)
 
 

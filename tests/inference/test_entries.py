@@ -735,6 +735,7 @@ def test_arrays_in_other_units_are_refused_or_normalised_by_the_sensor(
     for given in (scaled, by_laser.write(scaled)):
         result = described(given)
         assert (result.labels == expected).mean() > 0.995
+        assert result.origin is not None
         assert "over the ground" in result.origin.assumed
 
 
@@ -760,6 +761,8 @@ def test_a_scan_that_is_moved_and_moved_back_keeps_the_rows_of_its_lasers(
     described = amvnet.load(by_laser.weights, sensor=how)
     for given in (moved, by_laser.write(moved)):
         result = described(given)
+        assert result.origin is not None
+        assert expected.origin is not None
         row = expected.origin.scan.row
         assert row is not None
         np.testing.assert_array_equal(result.origin.scan.row, row)
@@ -854,6 +857,7 @@ def test_missing_intensities_are_counted(saved: World) -> None:
     with pytest.warns(UserWarning, match="no intensity in 1[012] % of the points"):
         saved.segmenter(points)
     result = saved.segmenter(saved.write(points))
+    assert result.origin is not None
     assert (
         f"no intensity in {np.isnan(points[:, 3]).sum()} of 1,500 points" in result.origin.assumed
     )

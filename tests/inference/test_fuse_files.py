@@ -109,6 +109,7 @@ def test_single_scans_are_fused_and_lost_points_have_no_class(
     result = amvnet.load(weights)(points)
 
     for name, probabilities in (("rv", result.rv), ("bev", result.bev)):
+        assert probabilities is not None
         (tmp_path / name).mkdir()
         np.save(tmp_path / name / "a.npy", probabilities.astype(np.float64))
 

@@ -152,6 +152,7 @@ def test_map_coordinates_keep_their_millimetres(kind: str, tmp_path: Path) -> No
     xyz, ids, _ = make_scan(np.float64, 5_400_000.0)
     path = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
     written = READERS[kind](path).xyz
+    assert written is not None
 
     errors = np.delete(np.abs(written - xyz), LOST, axis=0)
     assert errors.max() < 0.0005

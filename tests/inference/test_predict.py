@@ -436,6 +436,8 @@ def test_the_end_counts_the_classes_of_the_label_files_and_names_commands_that_r
 
     view = re.search(r"^look at them: amvnet (.*)$", printed, re.M)
     train = re.search(r"^train on your labels.*: amvnet (train .*)$", printed, re.M)
+    assert view is not None
+    assert train is not None
     assert run_cli(*shlex.split(view[1]))[0] == 0
     assert "--data YOURS.yaml" in train[1]
 

@@ -474,6 +474,7 @@ def test_agreement_needs_no_head(result: Segmentation) -> None:
 
 def test_fusing_leaves_the_callers_head_as_it_was() -> None:
     head = WEIGHTS.build().point_head
+    assert head is not None
     head.train()
     f = equal_probabilities()
     fuse(POINTS, f, f, head=head)

@@ -76,6 +76,7 @@ def test_labels_of_another_tau_are_not_judged_by_the_share_usual_for_the_weights
     assert amvnet.load(weights, tau=tau)(POINTS).verdict == amvnet.load(weights)(POINTS).verdict
 
     verdict = amvnet.load(weights, tau=1.0)(POINTS).verdict
+    assert verdict is not None
     assert verdict.share == 1
     assert not verdict.is_doubtful
     assert str(verdict) == "100.0% of the points are uncertain"
@@ -84,6 +85,7 @@ def test_labels_of_another_tau_are_not_judged_by_the_share_usual_for_the_weights
 def test_a_result_has_the_share_of_its_valid_points() -> None:
     points = np.concatenate([POINTS, np.full((100, 4), np.nan, np.float32)])
     result = amvnet.load(with_usual(0.1))(points)
+    assert result.verdict is not None
     assert result.verdict.share == result.uncertain[: len(POINTS)].mean()
     assert result.verdict.usual == 0.1
 
@@ -93,11 +95,13 @@ def test_one_network_is_judged_by_its_mean_entropy(method: Any) -> None:
     points = np.concatenate([POINTS, np.full((100, 4), np.nan, np.float32)])
     result = amvnet.load(fresh_weights(), method=method)(points)
     network = result.bev if method == "bev" else result.rv
+    assert network is not None
     classes = network.shape[1]
     entropies = []
     for row in network[: len(POINTS)].tolist():
         entropies.append(sum(-p * math.log(p, classes) for p in row if p > 0))
     verdict = result.verdict
+    assert verdict is not None
     assert verdict.share == pytest.approx(np.mean(entropies), abs=1e-6)
     assert verdict.is_doubtful  # the network has learnt nothing
     assert "entropy" in str(verdict)

@@ -167,6 +167,7 @@ def test_the_diagnostics_have_the_verdict_of_other_entries(
 ) -> None:
     np.save(tmp_path / "scan.npy", scan(0))
     verdict = amvnet.load(weights, method=method)(tmp_path / "scan.npy").verdict
+    assert verdict is not None
 
     node = start(method=method)
     send(node, ros_message(scan(0)))

@@ -45,6 +45,8 @@ def normalise(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]
 
 def assert_alike(scan: Scan, expected: Scan, atol: float) -> None:
     np.testing.assert_allclose(scan.points, expected.points, atol=atol)
+    assert scan.row is not None
+    assert expected.row is not None
     assert np.abs(scan.row - expected.row).max() <= 1
 
 
@@ -66,6 +68,7 @@ def test_a_tilted_scan_is_levelled(tilt: tuple[float, float], axes: str) -> None
     xyz = scan_xyz()
     scan, line = normalise(in_axes(tilted(xyz, *tilt), axes))
     ground = find_ground(scan.points[:, :3].astype(np.float64))
+    assert ground is not None
     assert ground.tilt < 0.3
     assert ground.height == pytest.approx(1.73, abs=0.1)
     np.testing.assert_allclose(scan.points[:, 2], xyz[:, 2], atol=0.15)

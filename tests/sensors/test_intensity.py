@@ -235,6 +235,7 @@ def test_training_measures_the_intensities_that_weights_carry(tmp_path: Path) ->
     intensity = measured_intensity(data, ("00", "01"))
 
     each = [np.quantile(data.read(record).points[:, 3], PROBABILITIES) for record in records]
+    assert intensity is not None
     np.testing.assert_allclose(intensity.quantiles, np.mean(each, axis=0), atol=1e-4)
 
 
@@ -331,6 +332,7 @@ def test_scans_that_sway_have_the_intensities_of_their_recording() -> None:
         estimate, is_usual = recording.estimate(cloud)
 
     assert is_usual
+    assert recording.usual is not None
     assert not recording.usual.is_steady
     assert estimate.quantiles is not None
     np.testing.assert_array_equal(estimate.quantiles, recording.usual.quantiles)

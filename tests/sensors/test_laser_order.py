@@ -49,6 +49,7 @@ def test_lost_returns_have_the_laser_of_the_point_before() -> None:
         changed = points.copy()
         changed[lost, :3] = value
         found = lasers_by_order(changed, LASERS)
+        assert found is not None
         assert np.array_equal(found[~lost], ring[~lost])
         assert found.min() >= 0
         assert found.max() < LASERS
@@ -126,6 +127,7 @@ def test_a_laser_that_sees_only_the_car_has_its_place(near: int) -> None:
     points[is_near, :2] = 0
     for ring in (LASERS - 1 - laser, other[laser]):
         scan, _ = order_rings(Scan(points, ring=ring))
+        assert scan.ring is not None
         assert sorted(set(scan.ring.tolist())) == list(range(LASERS))
 
 

@@ -60,6 +60,7 @@ def found(scans: list[np.ndarray], **sensor: Any) -> Body | None:
 def test_the_box_of_the_body_is_measured_and_its_share_of_the_points() -> None:
     scans = drive()
     body = found(scans)
+    assert body is not None
     np.testing.assert_allclose(body.box, BODY, atol=0.11)
     points = np.concatenate(scans)
     assert body.share == pytest.approx(is_inside(points, body.box).mean())
@@ -81,6 +82,7 @@ def test_the_box_is_in_metres_and_in_the_axes_of_the_file(
 ) -> None:
     scans = drive()
     body = found([change(xyz) for xyz in scans], **sensor)
+    assert body is not None
     unit = 1000 if change(np.eye(3))[0, 0] == 1000 else 1
     corners = change(np.array([BODY[:3], BODY[3:]])) / unit
     np.testing.assert_allclose(body.box[:3], corners.min(axis=0), atol=0.11)
@@ -105,6 +107,7 @@ def test_nothing_is_said_of_scans_that_show_no_body(scans: list[np.ndarray]) -> 
 
 def test_a_wall_along_the_way_is_not_of_the_body() -> None:
     body = found(drive(wall=1.5))
+    assert body is not None
     np.testing.assert_allclose(body.box, BODY, atol=0.11)
 
 
@@ -150,6 +153,7 @@ def test_the_known_body_of_nuscenes_car_is_measured_in_each_scene() -> None:
         records = dataset.records([scene])[::4]
         clouds = [Cloud(dataset.read(record, labels=False).points[:, :3]) for record in records]
         body = find_body(clouds, Sensor())
+        assert body is not None
         points = np.concatenate([cloud.xyz for cloud in clouds])
         known = is_inside(points, KNOWN_BODIES["hdl32e"])
         measured = is_inside(points, body.box)

@@ -64,6 +64,7 @@ def test_near_points_are_of_the_body_only_with_its_lasers_and_if_many(
 def test_lost_returns_hide_no_body_and_twice_as_many_rings_show_another_sensor() -> None:
     points, laser = on_nuscenes_car()
     expected = own_points(points, laser, Sensor())
+    assert expected is not None
     lost = np.arange(len(points)) % 50 == 0
     points[lost, :3] = np.nan
     for ring in (laser, None):
@@ -88,6 +89,7 @@ def test_the_body_that_a_scan_states_stays() -> None:
 def test_a_stated_body_counts_for_any_sensor() -> None:
     points, laser = place(LASERS["vlp16"], 0.9)
     own = own_points(points, laser, Sensor(own_body=BOX))
+    assert own is not None
     expected = [-1 <= x <= 14 and -2 <= y <= 5 and -0.5 <= z <= 0.6 for x, y, z, _ in points]
     assert own.tolist() == expected
     assert 0 < own.sum() < len(own)

@@ -83,6 +83,7 @@ def test_the_ground_is_the_lower_plane_even_if_more_cells_show_the_tops_of_hedge
     is_hedge = (np.floor(x / 2) + np.floor(y / 2)) % 5 < 3
     z = np.where(is_hedge, -0.6, -1.7) + rng.normal(0, 0.01, len(x))
     ground = find_ground(np.column_stack([x, y, z]))
+    assert ground is not None
     assert ground.height == pytest.approx(1.7, abs=0.05)
 
 
@@ -182,6 +183,7 @@ def test_any_frame_that_is_described_gives_the_same_scan(
 
 def assert_in_file(scan: Scan, file_xyz: np.ndarray) -> None:
     """Check that `to_file` moves the valid points to where they are in the file, in metres."""
+    assert scan.to_file is not None
     moved = scan.points[:, :3] @ scan.to_file[:3, :3].T + scan.to_file[:3, 3]
     np.testing.assert_allclose(moved[scan.valid], file_xyz[scan.valid], atol=1e-4)
 
@@ -232,6 +234,7 @@ def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None
     points, laser = place(LASERS["os1-64"], 0.8)
     normaliser, _ = make_normaliser()
     row = normaliser(make_cloud(points), "a").row
+    assert row is not None
 
     rows = []
     for index in range(64):
@@ -248,6 +251,7 @@ def test_rows_by_elevation_reach_half_a_row_beyond_the_lasers() -> None:
     view = RangeViewConfig(height=16, width=64, fov_up=3, fov_down=-25)
     lasers = SensorGeometry(64, fov_up=20.0, fov_down=-20.0)
     chosen = _row_view(points, lasers, Expectation(view, Sensor()))
+    assert chosen is not None
     half = 40 / 16 / 2
     assert (chosen.fov_up, chosen.fov_down) == (20 + half, -20 - half)
 

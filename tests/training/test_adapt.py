@@ -88,6 +88,8 @@ def test_points_teach_that_are_sure_and_seen_by_several_scans(world: Path) -> No
     assert figures["consistency"] == pytest.approx(agreeing / valid)
     both = 0
     for result in results:
+        assert result.rv is not None
+        assert result.bev is not None
         is_same = result.rv.argmax(axis=1) == result.bev.argmax(axis=1)
         both += int(np.count_nonzero(is_same & (result.labels > 0)))
     assert figures["agreement"] == pytest.approx(both / valid)

@@ -133,6 +133,8 @@ def test_lost_returns_stay_lost_and_keep_their_index(random_scan: RandomScan) ->
 
 def test_points_are_dropped_together_with_their_labels_and_rings(random_scan: RandomScan) -> None:
     scan = random_scan(1000)
+    assert scan.labels is not None
+    assert scan.ring is not None
 
     index_of = index_by_point(scan)
     shares = []
@@ -236,6 +238,7 @@ def test_objects_are_pasted_at_their_place_and_turned_once_or_twice(
     scan = random_scan(200, 1)
     other = random_scan(100, 2)
     assert scan.labels is not None
+    assert other.labels is not None
 
     classes = np.unique(other.labels)[1:3]
     is_object = np.isin(other.labels, classes)
@@ -256,6 +259,8 @@ def test_objects_are_pasted_at_their_place_and_turned_once_or_twice(
         assert (added[:, :, 2:] == added[0, :, 2:]).all()
         assert not np.allclose(added[1], added[0])
 
+        assert pasted.labels is not None
+        assert pasted.ring is not None
         times = len(added)
         assert np.array_equal(pasted.labels[len(scan) :], np.tile(other.labels[is_object], times))
         assert len(pasted.ring) == len(pasted)
@@ -369,12 +374,14 @@ def test_lasers_without_rings_are_bins_of_elevation(random_scan: RandomScan) -> 
 
 def test_whole_lasers_are_dropped_every_second_or_at_random(random_scan: RandomScan) -> None:
     scan = random_scan(3000)
+    assert scan.ring is not None
     all_rings = range(scan.ring.max() + 1)
     halves = [set(all_rings[::2]), set(all_rings[1::2])]
     second = 0
     shares = []
     for seed in range(60):
         changed = augmented(scan, replace(OFF, laser_drop=1.0), seed)
+        assert changed.ring is not None
         rings = set(changed.ring.tolist())
         assert len(changed) == np.isin(scan.ring, list(rings)).sum()
 
@@ -467,6 +474,8 @@ def from_other_scan(mixed: Scan, scan: Scan, other: Scan) -> np.ndarray:
             index = index_in_scan[point]
         is_foreign.append(source is other)
 
+        assert source.labels is not None
+        assert source.ring is not None
         assert label == source.labels[index]
         assert ring == source.ring[index]
     return np.array(is_foreign)

@@ -83,6 +83,7 @@ def test_predict_gives_finished_weights_the_intensities_of_their_training(
     plan = Plan.open(recipe, [data], tmp_path / "run", to_train, init, stage=stage)
     expects = expected_after(plan.data, first_weights(plan), plan.recipe, plan.stages)
     _, val = make_loaders(plan, recipe.training.rv, expects)
+    assert val is not None
     in_training = val.dataset[(0, 0)]
 
     dataset = normalised(open_dataset(data), Normaliser(expects))
@@ -105,6 +106,7 @@ def test_networks_learn_to_do_without_intensities_unless_one_of_them_stays() -> 
         (PARTS, ("head",), False),
     ):
         before = expected_before(known, parts, hiding, stages)
+        assert before.intensity is not None
         assert before.intensity.is_optional == expected
         assert expected_before(before, parts, recipe, stages) == before  # they forget nothing
 

@@ -228,6 +228,7 @@ def test_ones_own_scans_are_brought_to_the_initial_weights_rather_than_to_earlie
         dataset = open_for_training(str(own_file), recipe, tmp_path / "run", init)
         assert isinstance(dataset, OwnScans)
         assert isinstance(dataset.normalise, Normaliser)
+        assert dataset.normalise.expected is not None
         return dataset.normalise.expected.sensor.height
 
     save(by_height[1.0], tmp_path / "run/weights.safetensors")
@@ -246,6 +247,7 @@ def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) ->
 
     both = PointBatch.of([mix(a, b, np.random.default_rng(0))])
     view = RangeView(fresh_weights().model.range_view)
+    assert both.row is not None
     known = both.row >= 0
     assert 0 < known.sum() < len(known)
     assert torch.equal(view.rows(both)[known], both.row[known])

@@ -159,6 +159,7 @@ def test_the_loss_of_a_batch_is_the_mean_over_its_scans_and_so_is_its_gradient(
 def test_a_class_that_one_dataset_lacks_has_no_rivals_there() -> None:
     present = np.array([[1, 0, 0, 1], [1, 1, 0, 0]], bool)
     rivals = rival_classes(present)
+    assert rivals is not None
     # No dataset has the third class, so that all points count against it.
     assert rivals.tolist() == [[True, False, True, True], [True, True, True, False]]
     assert rival_classes(present[:1]) is None
@@ -312,6 +313,7 @@ def test_ignored_points_carry_no_gradient_and_the_others_do(region_loss: RegionL
     logits.requires_grad_()
     loss_of(region_loss, logits, labels, torch.rand(K), 1.0).backward()
     assert (labels == 0).any()
+    assert logits.grad is not None
     assert (logits.grad[labels == 0] == 0).all()
     assert logits.grad[labels > 0].any(dim=1).all()
 
@@ -335,6 +337,7 @@ def test_for_extreme_logits_the_gradient_of_the_loss_is_finite(region_loss: Regi
     logits, labels = example()
     logits = (logits * 1000).requires_grad_()
     loss_of(region_loss, logits, labels.to(torch.uint8), None, 1.0).backward()
+    assert logits.grad is not None
     assert logits.grad.isfinite().all()
 
 

@@ -94,6 +94,7 @@ def test_pixels_and_voxels_have_the_source_of_their_points(stage: str) -> None:
     made = make_stage(plan_with(CONFIG), stage, build_amvnet(MODEL_CONFIG, 19)).eval()
     with torch.no_grad():
         scored = made.compare((batch, labels, batch.scan))
+    assert scored.source is not None
     assert set(scored.source.tolist()) == {0, 1}
     assert scored.source.tolist() == scored.scan.tolist()
 
@@ -104,6 +105,7 @@ def test_a_voxel_with_points_of_two_datasets_has_the_first_as_its_source() -> No
         scored = polar_stage().compare(
             (PointBatch.of([scan]), torch.tensor([1, 1, 2]), torch.tensor([2, 1, 2]))
         )
+    assert scored.source is not None
     assert dict(zip(scored.labels.tolist(), scored.source.tolist(), strict=True)) == {1: 1, 2: 2}
 
 

@@ -76,7 +76,7 @@ def test_the_loss_of_the_head_equals_its_formula() -> None:
     config = SimpleNamespace(epochs=1, lr=0.1)
     stage = HeadStage(
         net,
-        None,  # no points: the batch is given
+        None,  # type: ignore[arg-type]  # no points: the batch is given
         None,
         config=config,
         taxonomy=SEMANTICKITTI,

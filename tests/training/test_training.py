@@ -210,6 +210,7 @@ def test_the_weights_describe_their_training(run: Path) -> None:
     assert weights.training["range_net"]["rv"]["epochs"] == 3
     assert weights.model.range_view.width == 64
     assert weights.expects.as_is
+    assert weights.expects.intensity is not None
     assert weights.expects.intensity.are_fractions
 
 

@@ -115,6 +115,8 @@ def test_the_page_has_the_probabilities_of_every_method(
     segmentation = amvnet.load(world / "w.safetensors")(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
     bev = segmentation.bev
+    assert rv is not None
+    assert bev is not None
     scores = {"rv": rv, "bev": bev, "ensemble": np.sqrt(rv * bev), "amvnet": segmentation.scores}
 
     _, planes = read_page(path).scan(0)
@@ -166,6 +168,8 @@ def test_disagreement_is_one_minus_the_cosine(
     segmentation = segmenter(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
     bev = segmentation.bev
+    assert rv is not None
+    assert bev is not None
 
     lengths = np.linalg.norm(rv, axis=1) * np.linalg.norm(bev, axis=1)
     expected = 1 - (rv * bev).sum(axis=1) / lengths
