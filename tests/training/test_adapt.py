@@ -103,6 +103,8 @@ def test_a_finished_run_is_resumed_and_another_one_refused(
     out = tmp_path / "run"
     shutil.copytree(world / "run", out)
     refused(command(world, out), "--resume")
+    shutil.copytree(out / "teacher", tmp_path / "begun/teacher")  # stopped before the training
+    refused(command(world, tmp_path / "begun"), "--resume")
 
     monkeypatch.setattr(Figures, "is_better_than", lambda self, other: True)
     succeed(command(world, out, "--resume", "--seed", 0))  # the default seed
