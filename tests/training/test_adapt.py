@@ -198,5 +198,8 @@ def test_loose_scans_teach_by_their_own_labels(
     scan = world / "data/sequences/00/velodyne/000000.bin"
     words = f"--weights {world}/w.safetensors --streets 0 --epochs 1"
     refused(f"adapt {scan} {words} --out {tmp_path}/a", "single scan")
-    code, _ = run_cli(*f"adapt {scan} {words} --loose --out {tmp_path}/b".split())
+    loose = f"adapt {scan} {words} --loose --out {tmp_path}/b"
+    refused(f"{loose} --poses {scan}", "--loose")
+    refused(f"{loose} --val-sequences 00", "expected --val,")
+    code, _ = run_cli(*loose.split())
     assert code == 0

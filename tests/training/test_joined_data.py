@@ -322,7 +322,7 @@ def test_a_training_distils_what_one_of_its_datasets_lacks_and_says_so(
         assert run_cli(*command, *options) == (0, "")
         out = capsys.readouterr().out
         assert "has hardly a point of car" in out
-        assert ("keep the probabilities of --init" in out) == (distill > 0)
+        assert ("keep the initial probabilities" in out) == (distill > 0)
         trained.append(load(tmp_path / name).part("range_net")["scores.bias"])
     assert (trained[0] != trained[1]).any()
 

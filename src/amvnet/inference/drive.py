@@ -254,8 +254,8 @@ def find_poses(
     for source, members in sources.items():
         if len(members) < LEAST_SCANS:
             raise InputError(
-                f"{source}: expected the consecutive scans of a drive, found a single scan; leave "
-                "--drive out, or give all scans"
+                f"{source}: expected the consecutive scans of a drive, found a single scan; "
+                "give all scans of the drive"
             )
 
     found: dict[tuple[str, str], Poses] = {}

@@ -293,7 +293,7 @@ def _notes(plan: Plan, name: str, taught: np.ndarray, rivals: np.ndarray | None)
     def listed(row: Any) -> str:
         return ", ".join(plan.data.taxonomy.classes[index] for index in np.flatnonzero(row))
 
-    kept = ", and keep the probabilities of --init there (distill)" if config.distill else ""
+    kept = ", and keep the initial probabilities there (distill)" if config.distill else ""
     for source, row in zip(sources, [] if rivals is None else ~rivals, strict=False):
         if row.any():
             yield (

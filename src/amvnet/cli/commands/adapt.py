@@ -10,6 +10,7 @@ from amvnet.cli.console import on_terminal, progress, report
 from amvnet.cli.options import LabelledChoice, ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Count, Seed, Share
 from amvnet.engines.compute import Compute
+from amvnet.errors import InputError
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset
@@ -69,6 +70,10 @@ def adapt(
     from amvnet.training.plan import Plan
     from amvnet.weights.file import load
 
+    if loose and poses:
+        raise InputError("--poses: expected no --loose, whose scans are no drive; leave one out")
+    if val_sequences and not val:
+        raise InputError("--val-sequences: expected --val, found none; add it")
     loaded = load(weights)
     sensor, options = sensor_choice.parse(), choice.parse()
     normaliser = Normaliser(loaded.expects, sensor, report)
