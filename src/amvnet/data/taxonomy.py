@@ -202,7 +202,7 @@ def check_classes(source: str, of_data: Taxonomy, of_weights: Taxonomy) -> None:
         raise InputError(
             f"{source}: expected weights with the classes of the data, found "
             f"{describe_difference(of_data.classes, of_weights.classes, of_weights.name)}; "
-            "use weights with these classes, or map both by --classes"
+            "use weights with these classes; amvnet evaluate also maps both by --classes"
         )
 
 
