@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -188,6 +189,15 @@ def test_streets_need_a_sensor_that_can_be_simulated(world: Path, tmp_path: Path
     line = command(world, tmp_path / "run").replace("--streets 0", "--streets 0.5")
     refused(line, "--streets 0")
     assert not (tmp_path / "run").exists()
+
+
+def test_weights_need_both_networks_and_a_head(world: Path, tmp_path: Path) -> None:
+    weights = load(world / "w.safetensors")
+    tensors = {name: t for name, t in weights.tensors.items() if not name.startswith("range_net")}
+    path = tmp_path / "w.safetensors"
+    save(replace(weights, tensors=tensors), path)
+    line = command(world, tmp_path / "run").replace(f"{world}/w.safetensors", str(path))
+    refused(line, "found no range_net; train that part")
 
 
 @pytest.mark.full

@@ -64,6 +64,7 @@ def adapt(
     from amvnet.data.datasets.training_data import Source, TrainingData
     from amvnet.inference.drive import digest_of, find_poses
     from amvnet.inference.listing import list_inputs
+    from amvnet.models.methods import check_method
     from amvnet.sensors.normalise import Normaliser
     from amvnet.training.adapt import adapt as adapt_weights
     from amvnet.training.adapt import recipe_for
@@ -75,6 +76,7 @@ def adapt(
     if val_sequences and not val:
         raise InputError("--val-sequences: expected --val, found none; add it")
     loaded = load(weights)
+    check_method("amvnet", loaded.parts)
     sensor, options = sensor_choice.parse(), choice.parse()
     normaliser = Normaliser(loaded.expects, sensor, report)
     scans, _ = list_inputs(inputs, options, loaded.taxonomy, normaliser)
