@@ -60,4 +60,5 @@ def test_a_request_that_does_not_fit_is_refused_in_one_line() -> None:
     fails(lambda: replace(request, tau=2.0), "tau")
     fails(lambda: replace(request, tau=float(np.nan)), "tau")
     fails(lambda: replace(request, method="rv", uncertain=True), "--uncertain")
+    fails(lambda: replace(request, method="rv", tau=0.3), "--tau")
     fails(lambda: LabellingRequest(incomplete), "point_head")

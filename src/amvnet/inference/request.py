@@ -34,8 +34,8 @@ class LabellingRequest:
 
     Raises:
         InputError: if the weights lack a part that the method needs, the method has no uncertain
-            points to write, the format is unknown, `classes` names no class of the weights, or
-            `tau` is out of range.
+            points to choose by `tau` or to write, the format is unknown, `classes` names no class
+            of the weights, or `tau` is out of range.
     """
 
     weights: Weights
@@ -57,8 +57,9 @@ class LabellingRequest:
         check_method(self.method, self.weights.parts)
         if self.tau is not None:
             Disagreement(self.tau)
+            check_two_networks(self.method, "--tau")
         if self.uncertain:
-            check_two_networks(self.method)
+            check_two_networks(self.method, "--uncertain")
         if self.classes is not None:
             self.classes.table(self.weights.taxonomy)
 

@@ -92,11 +92,11 @@ def methods_of(
     return [name for name in names if set(METHODS[name].parts) <= set(parts)]
 
 
-def check_two_networks(method: MethodName) -> None:
-    """Raise InputError if a method has one network, so that it knows no uncertain points."""
+def check_two_networks(method: MethodName, option: str) -> None:
+    """Raise InputError if a method has one network, so that an option on uncertain points fails."""
     if not METHODS[method].has_two_networks:
         raise InputError(
-            f"expected a method of two networks for --uncertain, found {method}; use amvnet"
+            f"expected a method of two networks for {option}, found {method}; use amvnet"
         )
 
 
