@@ -54,7 +54,7 @@ DRIVER = Path(__file__).parents[1] / "fixtures" / "web_modules.mjs"
 FORMATS = ("kitti.bin", "ascii.pcd", "binary.pcd", "compressed.pcd", "ascii.ply", "little.ply")
 # The page chooses among its own weights, so it names no built-in ones.
 NO_OTHERS = re.compile("; (no built-in weights have|[^;]* would fit)$")
-POLAR = PolarViewConfig(radial=40, angular=36, vertical=8)
+POLAR = PolarViewConfig(radial=40, angular=36, vertical=8, nearest=6)
 NEIGHBOURS = 15
 K = 3  # number of classes whose scores are made up
 FLOATS = (".points", ".image", ".features", ".scores")  # the arrays of float32; others are int32
@@ -80,7 +80,8 @@ class Case:
         view = expected.view
         rows = self.rows or view.rows
         # Coarse images have hidden points.
-        view = dataclasses.replace(view, rows=rows, width=view.width // 8, hidden=0.02)
+        width = view.width // 8
+        view = dataclasses.replace(view, rows=rows, width=width, hidden=0.02, nearest=6)
         intensity = self.intensity or expected.intensity
         sensor = dataclasses.replace(expected.sensor, **self.sensor)
         return dataclasses.replace(expected, view=view, intensity=intensity, sensor=sensor)
@@ -333,7 +334,7 @@ def tilt(points: np.ndarray) -> np.ndarray:
 
 def gather(points: np.ndarray) -> np.ndarray:
     """Move every third point to one place."""
-    points[::3, :3] = (3, 1, 0.5)
+    points[::3, :3] = (6, -3, 0.5)
     return points
 
 
@@ -441,6 +442,42 @@ def on_a_bank(folder: Path) -> Case:
     return Case(write_bin(folder / "bank.bin", points))
 
 
+def under_a_plane(below: float, folder: Path) -> Case:
+    """The plane is above the sensor. Far from it, a share of the points lies below it."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-25, 25, (2, 20_000))
+    far = np.hypot(x, y) > 20  # half of the points; nearer ones decide the plane
+    share = rng.uniform(0, far.mean(), len(x))
+    z = 2.0 + 5 * (far & (share < 0.2)) - 5 * (far & (share > far.mean() - below))
+    return Case(write_bin(folder / "under.bin", np.column_stack([x, y, z, rng.random(len(x))])))
+
+
+def between_walls(folder: Path) -> Case:
+    """Each of the two walls may be the ground."""
+    rng = np.random.default_rng(0)
+    x, z = rng.uniform(-25, 25, (2, 20_000))
+    y = rng.choice([-2, 2], len(x))
+    return Case(write_bin(folder / "walls.bin", np.column_stack([x, y, z, rng.random(len(x))])))
+
+
+def of_one_elevation(folder: Path) -> Case:
+    """All points lie on a line outside the field of view of the weights' sensor."""
+    radius = np.linspace(2, 20, 200)
+    np.save(folder / "line.npy", np.outer(radius, [1, 0, 1, 0.02]))
+    return Case(folder / "line.npy")
+
+
+def of_integers_and_nan(folder: Path) -> Case:
+    """The header says that the intensities are integers, but some are missing."""
+    points, _ = place(HDL64E, 1.73)
+    points[:, 3] = np.round(points[:, 3] * 255)
+    points[::9, 3] = np.nan
+    path = folder / "nan.pcd"
+    WRITERS["ascii.pcd"](path, points)
+    path.write_bytes(path.read_bytes().replace(b"TYPE F F F F", b"TYPE F F F U"))
+    return Case(path)
+
+
 def without_a_ground(folder: Path) -> Case:
     return Case(write_bin(folder / "few.bin", some_points(4000)))
 
@@ -508,6 +545,9 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     on_a_mound,
     on_a_hump,
     on_a_bank,
+    between_walls,
+    of_one_elevation,
+    of_integers_and_nan,
     without_a_ground,
     without_intensity,
     with_odd_intensities,
@@ -530,6 +570,7 @@ for make, is_optional in product((kitti_like, without_intensity, bright), (False
     MAKERS[name] = partial(for_weights_that_match_nothing, make, is_optional)
 for first, steps in ((12, 6), (12, 2), (20, 2), (15, 1), (10, 1)):
     MAKERS[f"raised_{first}_{steps}"] = partial(with_raised_lasers, first, steps)
+MAKERS |= {f"under_{share}": partial(under_a_plane, share) for share in (0.08, 0.12)}
 MAKERS |= {f"ground_{seed}": partial(on_random_ground, seed) for seed in range(20)}
 UNKNOWN_SENSORS: dict[str, dict[str, Any]] = {
     "unnamed": {"name": ""},
@@ -537,7 +578,7 @@ UNKNOWN_SENSORS: dict[str, dict[str, Any]] = {
 }
 for name, (what, sensor) in product(("raised_12_6", "of_fewer_lasers"), UNKNOWN_SENSORS.items()):
     MAKERS[f"{name}_{what}"] = partial(for_another_sensor, MAKERS[name], sensor)
-WITH_VIEWS = ("kitti_like", "nuscenes_like", "higher_with_lost_returns")
+WITH_VIEWS = ("kitti_like", "nuscenes_like", "higher_with_lost_returns", "coincident")
 Made = tuple[Case, dict[str, Any]]  # a scan, and what the page makes of it
 
 
@@ -587,6 +628,8 @@ def test_the_views_equal_those_of_the_onnx_runner(name: str, made: Callable[[str
     assert np.array_equal(page["pillar"], pillar)
     assert np.array_equal(page["voxel"], voxel)
     assert np.allclose(page["features"], features.ravel(), atol=1e-6)
+    assert np.array_equal(page["seen"], distances(points) >= POLAR.nearest)
+    assert 0 < page["seen"].mean() < 1
 
 
 @pytest.mark.parametrize("name", WITH_VIEWS)
@@ -606,8 +649,11 @@ def test_the_scores_of_points_equal_those_of_the_onnx_runner(
     assert not np.allclose(expected, scores[pixel])  # some points are hidden
 
 
-def test_neighbours_are_as_near_as_those_of_the_package(made: Callable[[str], Made]) -> None:
-    _, page = made("higher_with_lost_returns")
+@pytest.mark.parametrize("name", ["higher_with_lost_returns", "coincident"])
+def test_neighbours_are_as_near_as_those_of_the_package(
+    name: str, made: Callable[[str], Made]
+) -> None:
+    _, page = made(name)
     xyz = page["points"].reshape(-1, 4)[:, :3]
     own = np.arange(0, min(30_000, len(xyz)), 97)
     expected = nearest_others(xyz, own, NEIGHBOURS)

@@ -85,8 +85,8 @@ export function nearestOthers(points, own, n) {
   const neighbours = new Uint32Array(own.length * n);
   own.forEach((point, row) => {
     const found = Array.from(tree.nearest(point, m));
-    // If many points coincide, a point may be missing from its own neighbours. Then the last neighbour is dropped.
-    if (m > 1) found.splice(found.includes(point) ? found.indexOf(point) : m - 1, 1);
+    // If many points coincide, a point may be missing from its own neighbours. Then -1 drops the last neighbour.
+    if (m > 1) found.splice(found.indexOf(point), 1);
     for (let rank = 0; rank < n; rank++) neighbours[row * n + rank] = found[Math.min(rank, found.length - 1)];
   });
   return neighbours;
