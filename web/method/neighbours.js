@@ -84,10 +84,9 @@ export function nearestOthers(points, own, n) {
   const tree = new KdTree(points), m = Math.min(n + 1, points.length / 4);
   const neighbours = new Uint32Array(own.length * n);
   own.forEach((point, row) => {
-    const found = Array.from(tree.nearest(point, m));
-    // If many points coincide, a point may be missing from its own neighbours. Then -1 drops the last neighbour.
-    if (m > 1) found.splice(found.indexOf(point), 1);
-    for (let rank = 0; rank < n; rank++) neighbours[row * n + rank] = found[Math.min(rank, found.length - 1)];
+    // A point is not always among its own nearest if many coincide. A lone point has no others: undefined becomes 0, itself.
+    const others = tree.nearest(point, m).filter((id) => id !== point);
+    for (let rank = 0; rank < n; rank++) neighbours[row * n + rank] = others[Math.min(rank, others.length - 1)];
   });
   return neighbours;
 }
