@@ -293,6 +293,7 @@ def test_both_downloads_have_the_same_ids(session: Session) -> None:
     ids = np.load(result["npy"])
     assert ids.dtype == np.uint32
     assert np.array_equal(ids, np.fromfile(result["label"], np.uint32))
+    assert result["names"] == ["street.label", "street.npy"]
 
 
 def test_the_viewer_draws_every_point_with_its_label(session: Session) -> None:
@@ -301,6 +302,8 @@ def test_the_viewer_draws_every_point_with_its_label(session: Session) -> None:
     ids = np.fromfile(result["label"], np.uint32)
     counts = np.unique(ids[ids > 0], return_counts=True)[1]
     assert sorted(filter(None, result["drawn"])) == sorted(counts.tolist())
+    assert set(np.flatnonzero(result["drawn"])) <= set(result["present"])
+    assert 0 not in result["present"]  # every drawn point has a class
 
 
 def test_a_broken_file_gives_its_line(session: Session) -> None:
@@ -308,6 +311,7 @@ def test_a_broken_file_gives_its_line(session: Session) -> None:
     assert result["state"] == "failed"
     assert result["problem"].startswith(f"{HOSTILE}.pcd: expected at least ")
     assert result["problem"].endswith("the file is truncated, copy it again")
+    assert result["line"] == ""
 
 
 def test_hostile_names_of_files_stay_names(session: Session) -> None:
