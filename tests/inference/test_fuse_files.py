@@ -394,6 +394,5 @@ def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monk
     commands = DocsPage("docs/fusing.md").commands
     assert len(commands) >= 8
     head = {"--training.head.epochs": 1, "--training.head.points": 3000}
-    run(commands, Changes(values={"simulate": {"--scans": 1}, "train": head}))
-    # The scores in files are float16, which decides near ties on these 500 random points.
-    assert (read_labels(Path("again")) == read_labels(Path("both"))).mean() >= 0.99
+    run(commands, Changes(values={"train": head}))
+    assert (read_labels(Path("again")) == read_labels(Path("both"))).mean() >= 0.999
