@@ -325,7 +325,8 @@ def image_rows(view: RangeViewConfig, scan: Scan) -> np.ndarray:
 def distances(points: np.ndarray) -> np.ndarray:
     """Return the (P,) distances of points (P, 4) from the sensor, metres."""
     xyz = points[:, :3]
-    return np.sqrt((xyz * xyz).sum(axis=1))
+    distance: np.ndarray = np.sqrt((xyz * xyz).sum(axis=1))
+    return distance
 
 
 def polar_features(
@@ -359,18 +360,21 @@ def disagree(assertion: AssertionConfig, f: np.ndarray, g: np.ndarray) -> np.nda
     """Return (P,) bool: whether a point is uncertain, given probabilities f and g, (P, K)."""
     squared_lengths = (f * f).sum(axis=1) * (g * g).sum(axis=1)
     similarity = (f * g).sum(axis=1) / np.sqrt(np.maximum(squared_lengths, TINY))
-    return np.minimum(similarity, 1) <= assertion.threshold
+    uncertain: np.ndarray = np.minimum(similarity, 1) <= assertion.threshold
+    return uncertain
 
 
 def softmax(scores: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the (P, K) probabilities of logits (P, K)."""
     powers = np.exp(scores - scores.max(axis=1, keepdims=True))
-    return powers / powers.sum(axis=1, keepdims=True)
+    probabilities: NDArray[np.float32] = powers / powers.sum(axis=1, keepdims=True)
+    return probabilities
 
 
 def _cells(share: NDArray[np.floating], cells: int) -> NDArray[np.int64]:
     """Return which of `cells` equal parts of [0, 1] holds a number, or else is nearest to it."""
-    return np.clip(np.floor(share * cells).astype(np.int64), 0, cells - 1)
+    nearest: NDArray[np.int64] = np.clip(np.floor(share * cells).astype(np.int64), 0, cells - 1)
+    return nearest
 
 
 def _check_rings(ring: np.ndarray, height: int) -> None:

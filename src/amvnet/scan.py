@@ -120,7 +120,8 @@ class Scan:
 def at_origin(xyz: NDArray[np.floating]) -> NDArray[np.intp]:
     """Return the (M,) indices of the points at 0, 0, 0, given (N, 3 or more) coordinates."""
     on_axis = np.flatnonzero(xyz[:, 0] == 0)  # so few that the other coordinates take no time
-    return on_axis[(xyz[on_axis, 1] == 0) & (xyz[on_axis, 2] == 0)]
+    indices: NDArray[np.intp] = on_axis[(xyz[on_axis, 1] == 0) & (xyz[on_axis, 2] == 0)]
+    return indices
 
 
 def yaw_rotation(yaw: float) -> np.ndarray:

@@ -78,7 +78,8 @@ def raised(xyz: np.ndarray, labels: np.ndarray, is_ground: np.ndarray) -> np.nda
         level = max((np.roll(xyz, turn, axis=1) for turn in range(3)), key=_area)
         both = (ground & (_over_lowest(points) > RAISED) for points in (level, -level))
         is_raised = min(both, key=np.sum)
-    return np.bincount(labels[is_raised], minlength=len(is_ground))
+    counts: np.ndarray = np.bincount(labels[is_raised], minlength=len(is_ground))
+    return counts
 
 
 def _area(xyz: np.ndarray) -> int:

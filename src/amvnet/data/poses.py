@@ -218,7 +218,8 @@ def _from_camera(poses: Poses, calibration: Path) -> Poses:
         except ValueError:
             break
         check_rigid(to_camera[None], f"{calibration}: Tr")
-        return np.linalg.inv(to_camera) @ poses @ to_camera
+        moved: Poses = np.linalg.inv(to_camera) @ poses @ to_camera
+        return moved
     raise InputError(
         f"{calibration}: expected a line Tr: with 12 numbers, which moves points into camera 0, "
         "found none; take KITTI's file, or remove it if the poses are the LiDAR's"

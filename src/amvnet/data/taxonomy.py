@@ -149,7 +149,8 @@ class Taxonomy:
                 f"expected the raw ids of {self.name} "
                 f"({', '.join(map(str, self.train_to_raw[1:]))}), found {found}; {advice or usual}"
             )
-        return train_ids.astype(np.uint8)
+        checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
+        return checked
 
     def to_raw(self, ids: NDArray[np.integer]) -> NDArray[np.uint32]:
         """Return the raw ids (N,) uint32 of train ids (N,); raise InputError if one is wrong."""
@@ -160,7 +161,8 @@ class Taxonomy:
                 f"found {ids.min()}..{ids.max()}; give train ids of this taxonomy"
             )
 
-        return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
+        raw_ids: NDArray[np.uint32] = np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
+        return raw_ids
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON.

@@ -66,7 +66,8 @@ class VoxelTable:
     def means(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return the (M, C - 1) weighted means; the last sum of a voxel is its total weight."""
         sums = self._sums[self.rows(keys)]
-        return sums[:, :-1] / sums[:, -1:]
+        means: NDArray[np.float32] = sums[:, :-1] / sums[:, -1:]
+        return means
 
     def scans(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the number of scans (M,) that see each voxel."""
@@ -279,7 +280,8 @@ def keys_of(index: NDArray[np.int64]) -> NDArray[np.int64]:
     Voxels have the same number if they are a multiple of 2^21 voxels apart in x, y and z.
     """
     x, y, z = (index & ((1 << _BITS) - 1)).T
-    return x << (2 * _BITS) | y << _BITS | z
+    keys: NDArray[np.int64] = x << (2 * _BITS) | y << _BITS | z
+    return keys
 
 
 def index_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -54,7 +54,8 @@ class Odometry:
     def __call__(self, xyz: NDArray[np.floating]) -> Poses:
         """Return the pose (4, 4) of the next scan, given its valid points (M, 3) in metres."""
         self._odometry.register_frame(np.asarray(xyz, np.float64), np.empty(0))
-        return self._odometry.last_pose.copy()
+        pose: Poses = self._odometry.last_pose.copy()
+        return pose
 
 
 @dataclass(frozen=True)

@@ -177,7 +177,8 @@ class MapBuilder:
         """Return (K + 1,) bool: the classes whose points may move, by train id."""
         coarse = class_map("coarse")
         ids = [coarse.target.names.index(name) for name in MOVABLE]
-        return np.isin(coarse.table(self.taxonomy), ids)
+        is_movable: NDArray[np.bool_] = np.isin(coarse.table(self.taxonomy), ids)
+        return is_movable
 
 
 def check_ending(path: Path) -> None:

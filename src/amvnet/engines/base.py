@@ -76,7 +76,8 @@ class Engine:
         """Return the scores of the points of a batch, which is on the device of the engine."""
         model = self.model
         if METHODS[self.method].has_two_networks:
-            return model(batch)
+            scores: Scores = model(batch)
+            return scores
         if self.method == "bev":
             g = model.score_polar(model.polar_view.project(batch))
             return Scores(g, _none_uncertain(g), rv=None, bev=g)

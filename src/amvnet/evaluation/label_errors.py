@@ -206,14 +206,16 @@ def _middle_points(
     order = np.lexsort((squared_distance, group))
     group_starts = np.cumsum(sizes) - sizes
 
-    return order[group_starts]
+    nearest: NDArray[np.intp] = order[group_starts]
+    return nearest
 
 
 def _most_common(ids: NDArray[np.integer], group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """Return the most common id in each of `count` groups; among equals, the lowest id."""
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
-    return table.argmax(axis=1)
+    most_common: NDArray[np.intp] = table.argmax(axis=1)
+    return most_common
 
 
 def write_clusters(

@@ -181,7 +181,8 @@ def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
     shown_root = without_secrets(root)
     with reaching(shown_root), suppress(pa.ArrowInvalid):  # not a scheme of pyarrow
         uri = f"{root}{URL_OPTIONS.get(scheme, '/')}"
-        return fs.FileSystem.from_uri(uri)
+        opened: tuple[fs.FileSystem, str] = fs.FileSystem.from_uri(uri)
+        return opened
     try:
         opened = fs.FileSystem.from_uri(f"fsspec+{root}")
     except (ImportError, ValueError) as error:

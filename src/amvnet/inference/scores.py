@@ -197,7 +197,8 @@ def are_probabilities(values: np.ndarray) -> np.ndarray:
 
 def have_opinion(values: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (P,) bool: whether each row of (P, K) probabilities prefers a class."""
-    return (values != values[:, :1]).any(axis=1)
+    is_opinion: NDArray[np.bool_] = (values != values[:, :1]).any(axis=1)
+    return is_opinion
 
 
 def check_logits(values: np.ndarray, name: str) -> None:

@@ -128,7 +128,8 @@ class Segmentation:
     @property
     def confidence(self) -> NDArray[np.float32]:
         """(N,) probability of each point's label, in [0, 1]; 0 for points that are not valid."""
-        return self.probabilities.max(axis=1, initial=0)
+        largest: NDArray[np.float32] = self.probabilities.max(axis=1, initial=0)
+        return largest
 
     @property
     def points(self) -> NDArray[np.floating]:
@@ -149,7 +150,8 @@ class Segmentation:
     @property
     def raw_ids(self) -> NDArray[np.uint32]:
         """(N,) the labels as ids of the benchmark's files (a car of SemanticKITTI is 10)."""
-        return self.require_origin().taxonomy.to_raw(self.labels)
+        raw: NDArray[np.uint32] = self.require_origin().taxonomy.to_raw(self.labels)
+        return raw
 
     @property
     def verdict(self) -> Verdict | None:

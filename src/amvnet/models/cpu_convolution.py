@@ -29,9 +29,10 @@ def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, stride: Pair, paddi
     if torch.is_grad_enabled():
         is_avx2 = torch.backends.cpu.get_cpu_capability() == "AVX2"
         if is_avx2 and bias is None and weight.requires_grad:
-            return _Convolution.apply(  # type: ignore[no-untyped-call]
+            output: Tensor = _Convolution.apply(  # type: ignore[no-untyped-call]
                 x, weight, stride, padding
             )
+            return output
     elif weight.shape[2:] == (1, 1) and torch.backends.mkldnn.is_available():
         return torch.mkldnn_convolution(
             x, weight, bias, padding=padding, stride=stride, dilation=(1, 1), groups=1

@@ -49,7 +49,8 @@ def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
     if not x.requires_grad:
         return _pad_width(x, left, right)
 
-    return _WrapWidth.apply(x, left, right)  # type: ignore[no-untyped-call]
+    wrapped: Tensor = _WrapWidth.apply(x, left, right)  # type: ignore[no-untyped-call]
+    return wrapped
 
 
 def _pad_width(x: Tensor, left: int, right: int) -> Tensor:

@@ -47,7 +47,8 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     slot = np.empty(len(xyz), dtype=np.int64)  # each point, or the last one kept in its place
     slot[order] = is_kept.cumsum() - 1
     queries, rows = np.unique(slot[own], return_inverse=True)
-    return kept[_nearest_others(xyz[kept], queries, n)][rows]
+    nearest: np.ndarray = kept[_nearest_others(xyz[kept], queries, n)][rows]
+    return nearest
 
 
 def _may_have_crowds(xyz: np.ndarray, most: int) -> bool:

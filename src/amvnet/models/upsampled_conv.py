@@ -13,7 +13,8 @@ def apply_to_joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
     """Apply a `ConvBlock` to `torch.cat([upsample(coarse, fine), fine], dim=1)`."""
     convolution, norm, activation = block.children()
     assert isinstance(convolution, RingConv2d)
-    return activation(norm(convolve_joined(convolution, coarse, fine)))
+    output: Tensor = activation(norm(convolve_joined(convolution, coarse, fine)))
+    return output
 
 
 def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Tensor:
@@ -33,7 +34,8 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     scale = (fine.shape[2] // coarse.shape[2], fine.shape[3] // coarse.shape[3])
     is_multiple = fine.shape[2:] == (coarse.shape[2] * scale[0], coarse.shape[3] * scale[1])
     if not is_multiple:
-        return convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
+        output: Tensor = convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
+        return output
 
     coarse_weight = convolution.weight[:, : coarse.shape[1]]
     fine_weight = convolution.weight[:, coarse.shape[1] :]

@@ -138,7 +138,8 @@ def _lowest_points(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
     np.minimum.at(heights, cell, xyz[:, 2])
     lowest = xyz[:, 2] == heights[cell]  # several points of a cell may be equally low
     _, first = np.unique(cell[lowest], return_index=True)
-    return xyz[lowest][first]
+    found: NDArray[np.floating] = xyz[lowest][first]
+    return found
 
 
 def _best_plane(
@@ -163,7 +164,8 @@ def _best_plane(
     above = low[:, 2] - planes @ _with_ones(low).T  # (planes, M) metres
     agreeing = (np.abs(above) < TOLERANCE) @ weight
     below = (above < -3 * TOLERANCE) @ weight
-    return planes[(agreeing - below).argmax()]
+    best: NDArray[np.floating] = planes[(agreeing - below).argmax()]
+    return best
 
 
 def _with_ones(xyz: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -109,7 +109,8 @@ def _elevations_of_rings(xyz: np.ndarray, ring: np.ndarray) -> tuple[np.ndarray,
     """
 
     def means_of(values: np.ndarray) -> np.ndarray:
-        return np.bincount(ring, values) / np.maximum(np.bincount(ring), 1)
+        means: np.ndarray = np.bincount(ring, values) / np.maximum(np.bincount(ring), 1)
+        return means
 
     elevation = elevations(xyz)
 

@@ -148,4 +148,7 @@ def _with_laser_ends(
 
 def elevations(xyz: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the (N,) elevations of (N, 3) points, degrees above the horizon."""
-    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+    degrees: NDArray[np.floating] = np.degrees(
+        np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
+    )
+    return degrees

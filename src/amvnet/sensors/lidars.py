@@ -171,7 +171,8 @@ def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> NDArray[np.f
     about_z = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
     about_y = np.array([[cos_pitch, 0, sin_pitch], [0, 1, 0], [-sin_pitch, 0, cos_pitch]])
     about_x = np.array([[1, 0, 0], [0, cos_roll, -sin_roll], [0, sin_roll, cos_roll]])
-    return about_z @ about_y @ about_x
+    rotation: NDArray[np.float64] = about_z @ about_y @ about_x
+    return rotation
 
 
 _SHEETS = tomllib.loads((files("amvnet.sensors") / "lidars.toml").read_text(encoding="utf-8"))

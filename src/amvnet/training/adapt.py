@@ -96,7 +96,8 @@ class TaughtScans(Dataset):
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
         """Return the (N,) train ids that teach; 0 for points that teach nothing."""
         assert record.labels_path is not None
-        return np.load(record.labels_path, allow_pickle=False)
+        ids: np.ndarray = np.load(record.labels_path, allow_pickle=False)
+        return ids
 
     def train_ids_by_raw(self) -> np.ndarray:
         """Return each train id as its own raw id."""

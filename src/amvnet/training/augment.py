@@ -176,7 +176,8 @@ def lasers(scan: Scan) -> np.ndarray:
     elevation = np.nan_to_num(_elevations(scan))
     lowest, highest = _spread(elevation)
     borders = np.linspace(lowest, highest, ELEVATION_BINS + 1)[1:-1]
-    return np.searchsorted(borders, elevation, side="right")
+    laser: NDArray[np.intp] = np.searchsorted(borders, elevation, side="right")
+    return laser
 
 
 def _drop_lasers(scan: Scan, rng: np.random.Generator) -> Scan:
@@ -234,12 +235,14 @@ def _distort_intensity(
 def _in_sector(scan: Scan, start: float, width: float) -> NDArray[np.bool_]:
     """Return (N,) bool: whether a point's azimuth is at most `width` radians beyond `start`."""
     azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
-    return (azimuth - start) % (2 * np.pi) < width
+    is_inside: NDArray[np.bool_] = (azimuth - start) % (2 * np.pi) < width
+    return is_inside
 
 
 def _elevations(scan: Scan) -> NDArray[np.floating]:
     x, y, z = scan.points[:, :3].T
-    return np.arctan2(z, np.hypot(x, y))
+    elevation: NDArray[np.floating] = np.arctan2(z, np.hypot(x, y))
+    return elevation
 
 
 def _spread(values: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -247,7 +250,8 @@ def _spread(values: NDArray[np.floating]) -> NDArray[np.floating]:
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
         return np.zeros(2)
-    return np.percentile(finite, [OUTLIERS, 100 - OUTLIERS])
+    ends: NDArray[np.floating] = np.percentile(finite, [OUTLIERS, 100 - OUTLIERS])
+    return ends
 
 
 def _keep(scan: Scan, mask: np.ndarray) -> Scan:

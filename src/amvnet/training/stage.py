@@ -109,7 +109,8 @@ class Stage(L.LightningModule):
 
         Every process must call this.
         """
-        return np.sum(self.processes.gather(self.matrix), axis=0)
+        total: NDArray[np.float64] = np.sum(self.processes.gather(self.matrix), axis=0)
+        return total
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Log the number of epochs that are done, which places the loss in a diagram."""

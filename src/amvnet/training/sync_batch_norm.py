@@ -16,7 +16,8 @@ def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
     The network is changed in place and returned. On GPUs, PyTorch's `SyncBatchNorm` is used.
     """
     if cuda:
-        return nn.SyncBatchNorm.convert_sync_batchnorm(net)
+        synchronised: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(net)
+        return synchronised
 
     for name, child in net.named_children():
         if isinstance(child, _BatchNorm):
@@ -91,4 +92,5 @@ class _ProcessSum(torch.autograd.Function):
 
 
 def _sum_over_processes(x: Tensor) -> Tensor:
-    return _ProcessSum.apply(x)  # type: ignore[no-untyped-call]
+    total: Tensor = _ProcessSum.apply(x)  # type: ignore[no-untyped-call]
+    return total

@@ -351,12 +351,14 @@ def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
 
 
 def _to_bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+    scaled: NDArray[np.uint8] = np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+    return scaled
 
 
 def _to_percent(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Map values in [0, 1] to 0..100, which deflate better than 0..255."""
-    return np.round(np.clip(values, 0, 1) * 100).astype(np.uint8)
+    scaled: NDArray[np.uint8] = np.round(np.clip(values, 0, 1) * 100).astype(np.uint8)
+    return scaled
 
 
 def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -384,7 +386,8 @@ def _ramp(name: str, start: float, end: float) -> list[list[int]]:
     from matplotlib import colormaps
 
     colors = colormaps[name](np.linspace(start, end, RAMP_STOPS))[:, :3]
-    return (colors * 255).round().astype(int).tolist()
+    ramp: list[list[int]] = (colors * 255).round().astype(int).tolist()
+    return ramp
 
 
 def _source(name: str) -> str:

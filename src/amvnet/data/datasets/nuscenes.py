@@ -301,7 +301,8 @@ class NuScenes(Dataset):
                 "use the tables that came with the labels"
             )
 
-        return train_ids.astype(np.uint8)
+        checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
+        return checked
 
     def _read_records(self) -> dict[str, list[ScanRecord]]:
         """Read the tables; return the scans of every scene, by its name, in order of time."""

@@ -51,7 +51,8 @@ class BagPoses:
 
     def times(self) -> list[float]:
         """Return the time stamps of the scans in seconds; raise InputError if one is broken."""
-        return self._call(read_times, self.scan_topic)["times"].tolist()
+        times: list[float] = self._call(read_times, self.scan_topic)["times"].tolist()
+        return times
 
     def odometry(self) -> str | None:
         """Return the first topic with odometry, or None if there is none."""
@@ -88,7 +89,8 @@ class BagPoses:
         return _by_odometry(name, transforms, found["frame"], found["times"], report)
 
     def _topics(self) -> dict[str, str]:
-        return self._call(pose_topics)["topics"]
+        topics: dict[str, str] = self._call(pose_topics)["topics"]
+        return topics
 
     def _call(self, function: Any, *arguments: Any) -> dict[str, Any]:
         with readable(self.path):
@@ -169,7 +171,8 @@ def _by_odometry(
             f"{shown(odometry.child)} to the scans' frame {shown(frame)}"
         )
         return poses
-    return poses @ np.linalg.inv(of_child[common]) @ of_lidar[common]
+    moved: Poses = poses @ np.linalg.inv(of_child[common]) @ of_lidar[common]
+    return moved
 
 
 def _climb(

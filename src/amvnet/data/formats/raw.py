@@ -198,11 +198,13 @@ def _are_near(
     """Return (N,) bool: whether a point is lost, or within the usual reach of a sensor."""
     is_lost = ~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
     is_near = (np.abs(x) < NEAR) & (np.abs(y) < NEAR) & (np.abs(z) < NEAR)
-    return is_lost | is_near
+    is_either: NDArray[np.bool_] = is_lost | is_near
+    return is_either
 
 
 def _are_intensities(values: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (N,) bool: whether a value can be an intensity, also of a lost point."""
     is_possible = (values >= 0) & (values <= MAX_INTENSITY)
     is_missing = (values == NO_INTENSITY) | ~np.isfinite(values)
-    return is_possible | is_missing
+    is_intensity: NDArray[np.bool_] = is_possible | is_missing
+    return is_intensity

@@ -59,7 +59,8 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     if ending == GZIP:
         return Cloud(**_call(read_gzip, path, ending, list(layout.columns), list(layout.dtypes)))
     if ending in ROW_READERS:
-        return _call(ROW_READERS[ending], path, ending, layout)
+        cloud: Cloud = _call(ROW_READERS[ending], path, ending, layout)
+        return cloud
     return make_cloud(read_columns(path, ending, COLUMN_NAMES), str(path))
 
 
@@ -69,7 +70,8 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     Raises:
         InputError: if the file is broken, lacks a column, or needs a package that is missing.
     """
-    return _call(COLUMN_READERS[ending], path, ending, wanted)
+    columns: Arrays = _call(COLUMN_READERS[ending], path, ending, wanted)
+    return columns
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:

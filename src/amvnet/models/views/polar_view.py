@@ -49,9 +49,10 @@ class PolarGrid:
     def pool(self, features: Tensor) -> Tensor:
         """Return the maximum (F, C) of the points' features (S, C) in each seen pillar."""
         if features.is_cpu and features.requires_grad and not torch.compiler.is_compiling():
-            return _PillarMaximum.apply(  # type: ignore[no-untyped-call]
+            maximum: Tensor = _PillarMaximum.apply(  # type: ignore[no-untyped-call]
                 features, self.seen_slot, len(self.seen)
             )
+            return maximum
         return _pillar_maximum(features, self.seen_slot, len(self.seen))
 
     def pool_by_parts(self, encode: Callable[[Tensor], Tensor], part_size: int) -> Tensor:

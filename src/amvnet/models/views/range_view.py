@@ -199,7 +199,8 @@ class RangeView:
     def _have_lasers(self, ring: Tensor, batch: PointBatch) -> Tensor:
         """Return (B,) bool: the scans of a sensor that has one laser for each row of the image."""
         highest = ring.new_full((batch.count,), -1).scatter_reduce_(0, batch.scan, ring, "amax")
-        return self.config.has_laser_per_row(highest)
+        have_lasers: Tensor = self.config.has_laser_per_row(highest)
+        return have_lasers
 
 
 def _range_of(values: Tensor, which: Tensor | None = None) -> tuple[int, int]:
