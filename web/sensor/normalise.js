@@ -69,9 +69,10 @@ function withoutOwn(points, rows, places, { xyz, ring, count }, unit) {
   const pointAt = (place) => [...xyz.subarray(3 * place, 3 * place + 3).map((value) => value * UNITS[unit])];
   const isOwn = (place) => pointAt(place).every((value, axis) => value >= BODY.low[axis] && value <= BODY.high[axis]);
   const kept = Uint32Array.from(places.keys()).filter((i) => !isOwn(places[i]));
+  if ((places.length - kept.length) / count < LEAST_OWN) return { points, rows, places };
   const part = places.filter((place) => place % QUICK_STEP === 0), inFile = [...part].flatMap((place) => [...pointAt(place), 0]);
   const lasers = lasersOf(Float64Array.from(inFile), ring && part.map((place) => ring[place]));
-  if ((places.length - kept.length) / count < LEAST_OWN || lasers.fov_up === null || !isLikeOf(lasers, BODY.sensor)) return { points, rows, places };
+  if (lasers.fov_up === null || !isLikeOf(lasers, BODY.sensor)) return { points, rows, places };
   const result = new Float32Array(4 * kept.length);
   kept.forEach((i, row) => result.set(points.subarray(4 * i, 4 * i + 4), 4 * row));
   return { points: result, rows: rows && Int32Array.from(kept, (i) => rows[i]), places: kept.map((i) => places[i]) };
