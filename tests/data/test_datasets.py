@@ -218,6 +218,20 @@ def test_semantickitti_opens_at_the_sequences_folder(tmp_path: Path) -> None:
     assert (first.name, second.name) == ("08/000000", "08/000001")
 
 
+def test_an_index_that_is_not_in_the_table_of_categories_is_refused(tmp_path: Path) -> None:
+    layout = make_nuscenes(tmp_path)
+    path = tmp_path / "v1.0-mini/category.json"
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps([row for row in rows if row["name"] != "vehicle.car"]))
+    (index,) = (row["index"] for row in rows if row["name"] == "vehicle.car")
+
+    dataset = open_dataset(layout.spec)
+    record = first_record(dataset, layout)
+    assert record.labels_path is not None
+    np.full(COUNTS[0], index, np.uint8).tofile(record.labels_path)
+    fails(lambda: dataset.read(record), record.labels_path, f"found {index}", "tables that came")
+
+
 def test_nuscenes_without_lidarseg_or_sensor_tables(tmp_path: Path) -> None:
     layout = make_nuscenes(tmp_path)
     for table in ("lidarseg", "calibrated_sensor", "sensor", "category"):
@@ -298,7 +312,7 @@ def test_nuscenes_own_names_of_splits_are_taken(tmp_path: Path) -> None:
 
 def test_an_empty_split_names_sequences_that_were_not_trained_on(layout: Layout) -> None:
     dataset = open_dataset(layout.spec)
-    (val,) = dataset.splits()["val"]
+    (val,) = dataset.split().part("val")
     fails(lambda: dataset.sequences("test"), f"not trained, such as --sequences {val}")
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from amvnet.weights.file import Weights
 
 # Only nuScenes has the last two splits.
-Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
+SplitName = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
 
 # The format of label files for scan files.
 FormatName = Literal["label", "npy", "ply", "pcd", "las", "laz"]
@@ -41,7 +41,7 @@ MAX_SEQUENCES = 20  # largest number of sequences that a line names
 class ScanChoice:
     """Which scans of the inputs to read, and how files hold them."""
 
-    split: Split = "all"
+    split: SplitName = "all"
     """the official split, for datasets."""
     sequences: tuple[str, ...] | None = None
     """sequences or scenes instead of a split, separated by commas, for datasets."""
@@ -71,13 +71,13 @@ class ScanChoice:
 class LabelledChoice:
     """Which labelled scans of the dataset to use."""
 
-    split: Split | None = None
+    split: SplitName | None = None
     """the split; default: val, and all for rank. If there is neither an official split nor one of
     your own, the last sequence validates."""
     sequences: tuple[str, ...] | None = None
     """sequences or scenes instead of a split, separated by commas."""
 
-    def records(self, dataset: Dataset, default: Split = "val") -> Sequence[ScanRecord]:
+    def records(self, dataset: Dataset, default: SplitName = "val") -> Sequence[ScanRecord]:
         """Return the scans, and report which scans they are.
 
         Raises:
@@ -135,7 +135,7 @@ class TrainingChoice:
         train, val = named_sequences(dataset, self.train_sequences, self.val_sequences)
         _report_unnamed(Source.labelled(dataset, train, val))
         splits = {"train": dataset.records(train), "val": dataset.records(val)}
-        test = dataset.having_labels(dataset.records(dataset.splits().get("test", ())))
+        test = dataset.having_labels(dataset.records(dataset.split().part("test")))
         if test:
             splits["test"] = test
         return splits
@@ -150,8 +150,10 @@ def report_unused(source: Source, title: str = "") -> None:
 
 def _report_unnamed(source: Source, title: str = "") -> None:
     """Report the scans of a dataset that its split does not name."""
+    split = source.dataset.split()
+    rest = source.dataset.records(split.part("rest") if split.is_given else ())
     used = {record.name for record in (*source.train, *source.val)}
-    unnamed = [record for record in source.dataset.left_out() if record.name not in used]
+    unnamed = [record for record in rest if record.name not in used]
     if unnamed:
         text = describe_records(unnamed)
         report(f"{title}not used, because the split does not name them: {text}")

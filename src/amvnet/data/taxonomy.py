@@ -28,6 +28,7 @@ SATURATION = 0.65
 VALUE = 0.95
 GOLDEN_ANGLE = 0.381966
 SHOWN = 5  # largest number of unknown ids or names that an error message lists
+MAX_KNOWN = 40  # the same for known ids
 UNKNOWN = -1  # the mark of raw ids without a train id in lookup tables
 
 Color = tuple[int, int, int]  # RGB in 0..255
@@ -125,17 +126,23 @@ class Taxonomy:
                 table[raw_id] = train_id
         return table
 
-    def to_train(self, raw: NDArray[np.integer], advice: str | None = None) -> NDArray[np.uint8]:
+    def to_train(
+        self,
+        raw: NDArray[np.integer],
+        advice: str | None = None,
+        table: NDArray[np.int16] | None = None,
+    ) -> NDArray[np.uint8]:
         """Return the train ids (N,) uint8 of raw ids (N,); only their lower 16 bits count.
 
         Args:
             advice: what the user can do about an unknown raw id; default: advice about labels.
+            table: the train ids by raw id, of labels; default: `train_ids_by_raw`.
 
         Raises:
             InputError: if a raw id is not in the table.
         """
         raw_ids = np.asarray(raw).astype(np.uint32) & np.uint32(INSTANCE_MASK)
-        train_ids = self.train_ids_by_raw[raw_ids]
+        train_ids = (self.train_ids_by_raw if table is None else table)[raw_ids]
 
         unknown = np.unique(raw_ids[train_ids == UNKNOWN]).tolist()
         if unknown:
@@ -145,9 +152,10 @@ class Taxonomy:
             usual = "write its raw ids, or describe your own in a YAML file (docs/own_data.md)"
             if self.name not in TAXONOMIES:
                 usual = "add them to a class or to ignored, or write ignored: rest"
+            ids = self.train_to_raw[1:] if table is None else np.flatnonzero(table > 0)
+            known = listed(list(map(str, ids)), MAX_KNOWN)
             raise InputError(
-                f"expected the raw ids of {self.name} "
-                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {found}; {advice or usual}"
+                f"expected the raw ids of {self.name} ({known}), found {found}; {advice or usual}"
             )
         checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
         return checked

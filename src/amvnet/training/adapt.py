@@ -72,7 +72,7 @@ class TaughtScans(Dataset):
         super().__init__(folder, weights.taxonomy)
         self._scans = {label_path(scan): scan for scan in scans}
 
-    def splits(self) -> dict[str, tuple[str, ...]]:
+    def parts(self) -> dict[str, tuple[str, ...]]:
         """Return the recordings; all of them train."""
         recordings = tuple(dict.fromkeys(scan.source for scan in self._scans.values()))
         return {"train": recordings, "all": recordings}

@@ -41,7 +41,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
         splits = choice.splits(dataset)
     except InputError:
         if choice == TrainingChoice():  # the error is not about names that the user gave
-            _check(dataset, {"all": dataset.records(dataset.trainable())})
+            _check(dataset, {"all": dataset.records(dataset.split().trainable)})
         raise
     usable = _check(dataset, splits)
     report(f"{counted(usable, 'scan')} can be trained on or scored")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from amvnet.data.datasets.split import Names, Split
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan
 from amvnet.data.labels.ids import check_count, read_ids, train_ids, write_ids
@@ -56,12 +57,14 @@ class Dataset(ABC):
         simulated_sensor: the sensor whose scans are simulated, new ones in each epoch; "" if the
             scans are recorded.
         described_sensor: what a description of the dataset says of the sensor, if anything.
+        ids_advice: what a user can do about an unknown id in labels; None is advice on files.
         normalise: makes scans of the points in the files; without it, points stay unchanged.
     """
 
     readers = 8
     simulated_sensor = ""
     described_sensor: str | Mapping[str, Any] | None = None
+    ids_advice: str | None = None
     normalise: Normalise | None = None
 
     def __init__(self, root: Path | str, taxonomy: Taxonomy, spec: str | None = None) -> None:
@@ -70,65 +73,44 @@ class Dataset(ABC):
         self.spec = spec or str(root)
 
     @abstractmethod
-    def splits(self) -> dict[str, tuple[str, ...]]:
-        """Return the sequences on disk of "all" and of each split that the dataset knows.
+    def parts(self) -> dict[str, Names]:
+        """Return the sequences on disk of "all" and of each split that the dataset knows."""
 
-        A split may have none.
+    def split(self) -> Split:
+        """Return how the sequences on disk are split.
+
+        The split of a benchmark counts if there are sequences to train on and to validate with.
         """
+        parts = self.parts()
+        return Split(parts, bool(parts.get("train") and parts.get("val")), self._with_labels)
+
+    def _with_labels(self, names: Names) -> Names:
+        labelled = {record.sequence for record in self.having_labels(self.records(names))}
+        return tuple(name for name in names if name in labelled)
 
     def lacks(self, split: str) -> str:
         """Return the error that says what a split without a sequence lacks."""
         return f"{self.spec}: expected sequences of the split {split}, found none; name others"
 
-    @property
-    def is_split(self) -> bool:
-        """Whether the dataset's own split has sequences to train on and to validate with."""
-        splits = self.splits()
-        return bool(splits.get("train") and splits.get("val"))
-
-    def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of a split, for "train" and "val" as `division` returns them.
+    def sequences(self, name: str) -> Names:
+        """Return the sequences of a split, for "train" and "val" as `Split.choose` returns them.
 
         Raises:
             InputError: if the split is unknown or has no sequence.
         """
-        splits = self.splits()
-        if split not in splits:
+        split = self.split()
+        if name not in split.parts:
             raise InputError(
-                f"{self.spec}: expected a split of {', '.join(splits)}, found {split!r}; give one "
-                "of them"
+                f"{self.spec}: expected a split of {', '.join(split.parts)}, found {name!r}; give "
+                "one of them"
             )
-        names = self.division()[split] if split in ("train", "val") else splits[split]
+        names = split.part(name)
+        if name in ("train", "val"):
+            train, val = split.choose()
+            names = train if name == "train" else val
         if not names:
-            raise InputError(self.lacks(split))
+            raise InputError(self.lacks(name))
         return names
-
-    def division(self) -> dict[str, tuple[str, ...]]:
-        """Return the sequences to train on ("train") and to validate with ("val") by default.
-
-        Without a split of its own, the last sequence of a dataset validates and the others train.
-        If only its "val" is on disk, that validates. If too few are on disk, one of both is empty.
-        """
-        splits = self.splits()
-        train, val = splits.get("train", ()), splits.get("val", ())
-        if not self.is_split:
-            trainable = self.trainable()
-            last = val or trainable[-1:]
-            others = tuple(name for name in trainable if name not in last)
-            if others:
-                return {"train": others, "val": last}
-        return {"train": train, "val": val}
-
-    def trainable(self) -> tuple[str, ...]:
-        """Return the sequences outside "test"; only those with labels, if any have labels."""
-        splits = self.splits()
-        names = tuple(name for name in splits["all"] if name not in splits.get("test", ()))
-        labelled = {record.sequence for record in self.having_labels(self.records(names))}
-        return tuple(name for name in names if name in labelled) or names
-
-    def left_out(self) -> list[ScanRecord]:
-        """Return the scans that the dataset's own split does not name, though it has one."""
-        return []
 
     @abstractmethod
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
@@ -204,6 +186,18 @@ class Dataset(ABC):
     def place_of_labels(self, record: ScanRecord) -> Path:
         """Return the file that holds the labels of a scan, or its prediction if none may."""
         return record.labels_path or self.root / record.prediction
+
+    def labels(self, record: ScanRecord, count: int) -> np.ndarray | None:
+        """Read the (N,) uint8 train ids of a scan of N = `count` points; None if it has no labels.
+
+        Raises:
+            InputError: as `raw_labels`, or if an id is unknown.
+        """
+        path = record.labels_path
+        if path is None:
+            return None
+        raw = self.raw_labels(record, count)
+        return train_ids(path, raw, self.taxonomy, self.ids_advice, self.train_ids_by_raw())
 
     @abstractmethod
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, not_trained_on
 from amvnet.data.formats.cloud import check_usable, ring_indices
@@ -67,6 +66,8 @@ class NuScenes(Dataset):
             not given, or a table is missing or broken.
     """
 
+    ids_advice = "use the tables that came with the labels"
+
     def __init__(self, root: Path | str, version: str | None = None) -> None:
         super().__init__(root, NUSCENES)
         self.version = self._find_version(version)
@@ -88,7 +89,7 @@ class NuScenes(Dataset):
         first = folder.relative_to(root).parts[0]
         return NuScenes.matches(root) and (first in FOLDERS or first.startswith("v1.0-"))
 
-    def splits(self) -> dict[str, tuple[str, ...]]:
+    def parts(self) -> dict[str, tuple[str, ...]]:
         """Return the scenes of each split of `SPLITS` that are on disk."""
         folder = self.root / "samples" / CHANNEL
         file_names = set(os.listdir(folder)) if folder.is_dir() else set()
@@ -104,7 +105,7 @@ class NuScenes(Dataset):
 
     def lacks(self, split: str) -> str:
         """Return the error that says which files to unpack, or which scenes to name instead."""
-        on_disk = self.splits()["all"]
+        on_disk = self.parts()["all"]
         unseen = [scene for scene in on_disk if not self._split(scene).endswith("train")]
         advice = f"or name {not_trained_on(unseen)}" if on_disk else "which the tables list"
         return (
@@ -155,10 +156,7 @@ class NuScenes(Dataset):
                 "correct the column"
             )
 
-        ids = None
-        if labels and record.labels_path is not None:
-            indices = self.raw_labels(record, len(points))
-            ids = self._categories_to_train(indices, record.labels_path)
+        ids = self.labels(record, len(points)) if labels else None
         return Scan(points, labels=ids, ring=ring, name=record.name)
 
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
@@ -288,21 +286,6 @@ class NuScenes(Dataset):
                 )
             table[row["index"]] = train_id
         return table
-
-    def _categories_to_train(self, indices: NDArray[np.integer], path: Path) -> NDArray[np.uint8]:
-        """Turn (N,) indices of category.json, from a file, into (N,) uint8 train ids."""
-        assert self._category_train_ids is not None  # no record has labels without this table
-        train_ids = self._category_train_ids[indices]
-
-        if (train_ids == UNKNOWN).any():
-            unknown = np.unique(indices[train_ids == UNKNOWN])[:5].tolist()
-            raise InputError(
-                f"{path}: expected indices of category.json, found {unknown}; "
-                "use the tables that came with the labels"
-            )
-
-        checked: NDArray[np.uint8] = train_ids.astype(np.uint8)
-        return checked
 
     def _read_records(self) -> dict[str, list[ScanRecord]]:
         """Read the tables; return the scans of every scene, by its name, in order of time."""

@@ -13,8 +13,8 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, Normalise, ScanRecord
 from amvnet.data.datasets.description import SPLITS, WILDCARDS, Description, below, read_description
+from amvnet.data.datasets.split import Split
 from amvnet.data.formats.find import ANY_FOLDERS, NamedScan, list_scans, matching, scan_stem
-from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.poses import Poses, read_poses, times_of
 from amvnet.data.taxonomy import Taxonomy, check_classes
@@ -36,23 +36,22 @@ class OwnScans(Dataset):
         self.normalise = normalise
         self._counts: dict[str, int] = {}  # points of the scans that have been read, by name
 
-    @property
-    def is_split(self) -> bool:
-        """Whether the file has a split; scans that it does not name are not chosen by default."""
-        return bool(self.description.split)
-
-    def splits(self) -> dict[str, tuple[str, ...]]:
+    def parts(self) -> dict[str, tuple[str, ...]]:
         """Return the sequences of "train", "val" and "test" by the file's split, and of "all"."""
-        splits: dict[str, set[str]] = {name: set() for name in (*SPLITS, "all")}
-        for record, split in self._listing:
-            for name in (split, "all") if split else ("all",):
-                splits[name].add(record.sequence)
-        return {name: tuple(sorted(sequences)) for name, sequences in splits.items()}
+        parts: dict[str, set[str]] = {name: set() for name in (*SPLITS, "all")}
+        for record, part in self._listing:
+            for name in (part or "rest", "all"):
+                parts.setdefault(name, set()).add(record.sequence)
+        return {name: tuple(sorted(sequences)) for name, sequences in parts.items()}
+
+    def split(self) -> Split:
+        """Return how the file splits the sequences, if it does."""
+        return dataclasses.replace(super().split(), is_given=bool(self.description.split))
 
     def lacks(self, split: str) -> str:
         """Return the error that says which splits the file has, if any."""
         found = f"only {' and '.join(self.description.split)}"
-        if not self.is_split:
+        if not self.description.split:
             labelled = {record.sequence for record, _ in self._listing if record.has_labels}
             alone = f", and labels of {min(labelled)} alone" if len(labelled) == 1 else ""
             found = f"no split{alone}"
@@ -61,13 +60,9 @@ class OwnScans(Dataset):
             "split, or name sequences to use"
         )
 
-    def left_out(self) -> list[ScanRecord]:
-        """Return the scans that the file's split does not name, if it has one."""
-        return [record for record, split in self._listing if self.is_split and not split]
-
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these sequences, in order."""
-        present = self.splits()["all"]
+        present = self.parts()["all"]
         for name in sequences:
             if name not in present:
                 raise InputError(
@@ -105,11 +100,7 @@ class OwnScans(Dataset):
         cloud = named.read()
         scan = cloud.to_scan() if self.normalise is None else self.normalise(cloud, named.source)
         self._counts[record.name] = len(scan)
-
-        ids = None
-        path = record.labels_path
-        if labels and path is not None:
-            ids = train_ids(path, self.raw_labels(record, len(scan)), self.taxonomy)
+        ids = self.labels(record, len(scan)) if labels else None
         return dataclasses.replace(scan, labels=ids, name=record.name)
 
     def read_unchanged(self, record: ScanRecord) -> Scan:
@@ -279,7 +270,8 @@ class OwnScans(Dataset):
         entries = []
         for split, names in self.description.split.items():
             entries += [(split, entry) for entry in names]
-        usual = "train" if self.is_split and "train" not in self.description.split else ""
+        is_trained_on = self.description.split and "train" not in self.description.split
+        usual = "train" if is_trained_on else ""
 
         splits = {}
         matched = set()
@@ -336,5 +328,5 @@ def open_own(path: Path | str) -> OwnScans:
         InputError: as `read_description`, or if there is no scan.
     """
     dataset = OwnScans(read_description(path))
-    dataset.splits()
+    dataset.parts()
     return dataset

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.split import Names, Split, without
 from amvnet.data.datasets.training_data import Source
 from amvnet.errors import InputError
 
 
 def to_train(
     dataset: Dataset,
-    train: Sequence[str] | None = None,
-    val: Sequence[str] | None = None,
+    train: Names | None = None,
+    val: Names | None = None,
     with_val: bool = False,
 ) -> Source:
     """Return the labelled scans to train on and to validate with.
 
     Args:
-        train, val: names of sequences; by default the sequences of `Dataset.division`.
+        train, val: names of sequences; by default the sequences that `Split.choose` returns.
         with_val: also train on the sequences of `val`, and validate with none.
 
     Raises:
@@ -37,11 +36,8 @@ def to_mix_in(dataset: Dataset) -> Source:
     Raises:
         InputError: if there are none.
     """
-    splits = dataset.splits()
-    if dataset.is_split:
-        names = splits["train"]
-    else:
-        names = _without(dataset.trainable(), splits.get("val", ()))
+    split = dataset.split()
+    names = without(split.trainable, split.part("val"))
     if not names:
         raise InputError(
             f"{dataset.spec}: expected sequences to train on, found none outside val and test; "
@@ -51,25 +47,21 @@ def to_mix_in(dataset: Dataset) -> Source:
 
 
 def named_sequences(
-    dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
-) -> tuple[Sequence[str], Sequence[str]]:
+    dataset: Dataset, train: Names | None, val: Names | None, with_val: bool = False
+) -> tuple[Names, Names]:
     """Return the sequences to train on and to validate with; `to_train` says what the arguments do.
 
     Raises:
         InputError: if no sequence is left for one of both, or one to train on is of the test split.
     """
-    # A sequence that the user named for one purpose is not used for the other by default.
-    usual = dataset.division()
-    trainable = usual["train"] if dataset.is_split else dataset.trainable()
-    names_val = val or _without(usual["val"], train or ())
-    names_train = train or _without(trainable, names_val)
-
+    split = dataset.split()
+    names_train, names_val = split.choose(train, val)
     if with_val:
-        names_train = (*names_train, *_without(names_val, names_train))
+        names_train = (*names_train, *without(names_val, names_train))
         names_val = ()
     elif not names_train or not names_val:
-        raise InputError(_too_few(dataset, train, val))
-    of_test = sorted(set(names_train) & set(dataset.splits().get("test", ())))
+        raise InputError(_too_few(dataset, split, train, val))
+    of_test = sorted(set(names_train) & set(split.part("test")))
     if of_test:
         raise InputError(
             f"{dataset.spec}: expected sequences to train on outside the test split, found "
@@ -78,24 +70,21 @@ def named_sequences(
     return names_train, names_val
 
 
-def _too_few(dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None) -> str:
+def _too_few(dataset: Dataset, split: Split, train: Names | None, val: Names | None) -> str:
     """Return the error that says why no sequence is left to train on or to validate with."""
-    trainable = dataset.trainable()
-    if not (train or val or dataset.is_split) and len(trainable) < 2:
+    trainable = split.trainable
+    if not (train or val or split.is_given) and len(trainable) < 2:
         return (
             f"{dataset.spec}: expected two sequences with labels, one to train on and one to "
             f"validate with, found {' '.join(trainable) or 'none'} alone; add another one, or "
             "divide it under split in a YAML file that describes the scans (docs/own_data.md)"
         )
-    usual = dataset.division()
-    for split, named in (("val", val), ("train", train)):
-        if not named and not usual[split]:
-            return dataset.lacks(split)
+    usual_train, usual_val = split.choose()
+    if not (val or usual_val):
+        return dataset.lacks("val")
+    if not (train or usual_train):
+        return dataset.lacks("train")
     return (
         f"{dataset.spec}: expected two sequences, one to train on and one to validate with, "
-        f"found {', '.join(dataset.splits()['all'])}; name them"
+        f"found {', '.join(split.part('all'))}; name them"
     )
-
-
-def _without(names: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name for name in names if name not in others)

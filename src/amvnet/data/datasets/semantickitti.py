@@ -10,7 +10,7 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset, ScanRecord, not_trained_on
 from amvnet.data.formats.cloud import check_usable
 from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
-from amvnet.data.labels.ids import check_bits, read_ids, train_ids
+from amvnet.data.labels.ids import check_bits, read_ids
 from amvnet.data.poses import Poses, read_poses
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
@@ -48,7 +48,7 @@ class SemanticKitti(Dataset):
         # `root` may be the folder of the sequences.
         return (root / first / "velodyne").is_dir() and rest in ([], ["velodyne"], ["labels"])
 
-    def splits(self) -> dict[str, tuple[str, ...]]:
+    def parts(self) -> dict[str, tuple[str, ...]]:
         """Return the sequences of "train", "val", "test" and "all" that are on disk."""
         present = self._sequences_on_disk()
         splits = {}
@@ -77,11 +77,7 @@ class SemanticKitti(Dataset):
         """Read one scan."""
         path = record.points_path
         points = check_usable(read_table(path, np.float32, KITTI_COLUMNS), path)
-        ids = None
-        if labels and record.labels_path is not None:
-            raw = self.raw_labels(record, len(points))
-            ids = train_ids(record.labels_path, raw, self.taxonomy)
-
+        ids = self.labels(record, len(points)) if labels else None
         return Scan(points, labels=ids, name=record.name)
 
     def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:

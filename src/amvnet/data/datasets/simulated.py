@@ -62,7 +62,7 @@ class SimulatedStreets(Dataset):
         super().__init__(root, CLASSES_BY_SENSOR[sensor], f"simulated-{sensor}:{root}")
         self.simulated_sensor = sensor
 
-    def splits(self) -> dict[str, tuple[str, ...]]:
+    def parts(self) -> dict[str, tuple[str, ...]]:
         """Return the streets of "train", "val" and "all"."""
         train = tuple(map(_name, range(TRAIN_STREETS[self.simulated_sensor])))
         val = tuple(map(_name, range(FIRST_VAL_STREET, FIRST_VAL_STREET + VAL_STREETS)))

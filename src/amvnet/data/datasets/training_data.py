@@ -96,7 +96,7 @@ class TrainingData:
             )
         apart: set[tuple[str, str]] = set()
         if others:
-            test = first.dataset.records(first.dataset.splits().get("test", ()))
+            test = first.dataset.records(first.dataset.split().part("test"))
             apart = {_identity(record) for record in (*first.val, *test)}
         for other in others:
             for record in other.train:

@@ -95,18 +95,22 @@ def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> Non
 
 
 def train_ids(
-    name: Path | str, raw: np.ndarray, taxonomy: Taxonomy, advice: str | None = None
+    name: Path | str,
+    raw: np.ndarray,
+    taxonomy: Taxonomy,
+    advice: str | None = None,
+    table: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the (N,) uint8 train ids of (N,) raw ids; an error names the likely mistake.
 
-    Messages begin with `name` and end with `advice`, as `Taxonomy.to_train` takes it.
+    Messages begin with `name`. `Taxonomy.to_train` takes `advice` and `table`.
 
     Raises:
         InputError: if an id is no raw id of the taxonomy, or all ids look like float32 or
             big-endian ids.
     """
     with errors_of(name):
-        return taxonomy.to_train(check_bits(name, raw), advice)
+        return taxonomy.to_train(check_bits(name, raw), advice, table)
 
 
 def check_bits(name: Path | str, raw: np.ndarray) -> np.ndarray:
