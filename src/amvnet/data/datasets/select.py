@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.split import Names, Split, without
 from amvnet.data.datasets.training_data import Source
@@ -10,8 +12,8 @@ from amvnet.errors import InputError
 
 def to_train(
     dataset: Dataset,
-    train: Names | None = None,
-    val: Names | None = None,
+    train: Sequence[str] | None = None,
+    val: Sequence[str] | None = None,
     with_val: bool = False,
 ) -> Source:
     """Return the labelled scans to train on and to validate with.
@@ -47,7 +49,7 @@ def to_mix_in(dataset: Dataset) -> Source:
 
 
 def named_sequences(
-    dataset: Dataset, train: Names | None, val: Names | None, with_val: bool = False
+    dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
 ) -> tuple[Names, Names]:
     """Return the sequences to train on and to validate with; `to_train` says what the arguments do.
 
@@ -70,7 +72,9 @@ def named_sequences(
     return names_train, names_val
 
 
-def _too_few(dataset: Dataset, split: Split, train: Names | None, val: Names | None) -> str:
+def _too_few(
+    dataset: Dataset, split: Split, train: Sequence[str] | None, val: Sequence[str] | None
+) -> str:
     """Return the error that says why no sequence is left to train on or to validate with."""
     trainable = split.trainable
     if not (train or val or split.is_given) and len(trainable) < 2:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -37,7 +37,9 @@ class Split:
         names = without(self.part("all"), self.part("test"))
         return self.having_labels(names) or names
 
-    def choose(self, train: Names | None = None, val: Names | None = None) -> tuple[Names, Names]:
+    def choose(
+        self, train: Sequence[str] | None = None, val: Sequence[str] | None = None
+    ) -> tuple[Names, Names]:
         """Return the sequences to train on and to validate with: the named ones, or the usual ones.
 
         Without a split of its own, the last sequence of a dataset validates and the others train.
@@ -48,9 +50,9 @@ class Split:
         if not (self.is_given or usual) and len(self.trainable) > 1:
             usual = self.trainable[-1:]
         val = val or without(usual, train or ())
-        return train or without(self.trainable, val), val
+        return tuple(train or without(self.trainable, val)), tuple(val)
 
 
-def without(names: Names, others: Collection[str]) -> Names:
+def without(names: Names, others: Sequence[str]) -> Names:
     """Return the names that are not among others, in order."""
     return tuple(name for name in names if name not in others)
