@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import struct
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -184,6 +185,41 @@ def test_scans_without_a_finite_point_are_written(kind: str, count: int, tmp_pat
     ids = np.zeros(count, np.uint8)
     path = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
     assert len(READERS[kind](path).raw) == count
+
+
+def test_open3d_keeps_all_columns_of_a_ply(tmp_path: Path) -> None:
+    """Its reader of tensors leaves out properties of all types but these."""
+    xyz, ids, uncertain = make_scan()
+    for offset in (0, 5_400_000.0):
+        path = write_scan_labels(tmp_path / "a", "ply", xyz + offset, ids, SEMANTICKITTI, uncertain)
+        header = path.read_bytes().split(b"end_header")[0].decode().splitlines()
+        types = {line.split()[1] for line in header if line.startswith("property")}
+        assert types <= {"uchar", "int", "float", "double"}
+
+
+@pytest.mark.parametrize("kind", ["las", "laz"])
+@pytest.mark.parametrize("count", [0, COUNT])
+def test_files_of_las_are_as_its_version_1_4_wants_them(
+    kind: str, count: int, tmp_path: Path
+) -> None:
+    """Of its revision 15, what holds for the point formats from 6 on."""
+    xyz, ids, uncertain = make_scan()
+    path = write_scan_labels(
+        tmp_path / "a", kind, xyz[:count], ids[:count], SEMANTICKITTI, uncertain[:count]
+    )
+    header = path.read_bytes()[:375]
+    (encoding,) = struct.unpack_from("<H", header, 6)
+    assert encoding & 0b10000  # WKT
+    assert not any(struct.unpack_from("<6I", header, 107))  # the counts of earlier versions
+    assert struct.unpack_from("<Q", header, 247)[0] == count
+    assert struct.unpack_from("<15Q", header, 255) == (count,) + 14 * (0,)
+
+    cloud = laspy.read(path)
+    assert (cloud.return_number == 1).all()
+    assert (cloud.number_of_returns == 1).all()
+    (system,) = cloud.header.vlrs.get("WktCoordinateSystemVlr")
+    assert system.string.startswith("LOCAL_CS[")
+    assert system.record_data_bytes().endswith(b"]\0")
 
 
 # --- errors ---

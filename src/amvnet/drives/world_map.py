@@ -25,7 +25,7 @@ MOVABLE = ("vehicle", "two-wheeler", "person")  # coarse classes whose points ma
 
 _PLY = (
     rb"ply\nformat binary_little_endian 1\.0\nelement vertex \d+\n"
-    rb"property double x\nproperty double y\nproperty double z\n.*property ushort sights\n"
+    rb"property double x\nproperty double y\nproperty double z\n.*property (int|ushort) sights\n"
 )
 # The program that wrote a LAS file stands at byte 58 of it.
 PROGRAM = "amvnet map"
@@ -47,13 +47,13 @@ class WorldMap:
         xyz: (V, 3) float64 mean of the points in each voxel, in the world, metres.
         labels: (V,) uint8 train ids.
         confidence: (V,) float32 probability of the label, in [0, 1].
-        sights: (V,) uint16 number of scans that see the voxel.
+        sights: (V,) int32 number of scans that see the voxel.
     """
 
     xyz: NDArray[np.float64]
     labels: NDArray[np.uint8]
     confidence: NDArray[np.float32]
-    sights: NDArray[np.uint16]
+    sights: NDArray[np.int32]
     taxonomy: Taxonomy
 
     def __len__(self) -> int:
@@ -63,7 +63,7 @@ class WorldMap:
         """Write the map as `.ply`, `.las` or `.laz`; the file appears whole or not at all.
 
         A PLY has x, y, z (double), red, green, blue (uchar), class (raw id, int), confidence
-        (float) and sights (ushort). LAS and LAZ have these values as coordinates, colours,
+        (float) and sights (int). LAS and LAZ have these values as coordinates, colours,
         classification and two extra dimensions.
 
         Raises:
@@ -169,7 +169,7 @@ class MapBuilder:
             xyz[is_kept],
             labels[is_kept],
             confidence.numpy()[is_kept],
-            np.minimum(scans[is_kept], np.iinfo(np.uint16).max).astype(np.uint16),
+            scans[is_kept],
             self.taxonomy,
         )
 

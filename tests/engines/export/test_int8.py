@@ -28,7 +28,7 @@ from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails, files, succeed
-from fixtures.exports import shallow_weights
+from fixtures.exports import check_versions, shallow_weights
 from fixtures.sensors import rings_of
 from fixtures.tiny import fresh_weights, street, trained_for, with_intensities, without
 
@@ -115,6 +115,11 @@ def kernels(model: Any) -> dict[str, Kernel]:
             integers, scale = nodes[name].input[:2]
             by_name[integers.removesuffix("_quantized")] = Kernel(stored[integers], stored[scale])
     return by_name
+
+
+@pytest.mark.parametrize("name", QUANTISED)
+def test_onnx_runtime_1_14_takes_the_graphs(exported: Folders, name: str) -> None:
+    check_versions(exported.int8 / f"{name}.onnx")
 
 
 @pytest.mark.parametrize("name", QUANTISED)

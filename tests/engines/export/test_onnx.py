@@ -36,7 +36,7 @@ from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails, files, refusal, refused, run_cli, succeed
 from fixtures.examples import first_of
-from fixtures.exports import shallow_weights
+from fixtures.exports import check_versions, shallow_weights
 from fixtures.pages import DocsPage
 from fixtures.sensors import rings_of
 from fixtures.tiny import fresh_weights, street, with_intensities, without
@@ -212,6 +212,12 @@ def test_the_description_is_that_of_the_graphs(exported: Exports, name: str) -> 
         assert opsets[""] == description["opset"], graph_name
         check_values(graph["inputs"], model.graph.input)
         check_values(graph["outputs"], model.graph.output)
+
+
+@each_export
+def test_onnx_runtime_1_14_takes_the_graphs(exported: Exports, name: str) -> None:
+    for path in exported[name].folder.glob("*.onnx"):
+        check_versions(path)
 
 
 @each_export

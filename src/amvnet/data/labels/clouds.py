@@ -10,9 +10,16 @@ import numpy as np
 Columns = dict[str, np.ndarray]
 
 COLORS = ("red", "green", "blue")
-PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u2": "ushort", "u1": "uchar"}
+# Open3D's reader of tensors leaves out columns of any other type.
+PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 PCD_HEADER = "# .PCD v0.7 - labels of amvnet\nVERSION 0.7"
 LAS_FORMAT = 7  # the point format of LAS 1.4 with colours and classes up to 255
+# LAS 1.4 wants a coordinate system, as WKT in this point format. Axes and place are those of the
+# scan's file, and known to nobody else.
+LOCAL_COORDINATES = (
+    'LOCAL_CS["Local coordinates",LOCAL_DATUM["Local datum",32767],UNIT["metre",1],'
+    'AXIS["X",OTHER],AXIS["Y",OTHER],AXIS["Z",UP]]'
+)
 FULL_COLOR = 257  # colours of LAS have 16 bits: 255 * 257 = 65535
 MILLIMETRE = 0.001
 FARTHEST = 1_000_000.0  # largest coordinate, metres, from which 32 bits of millimetres reach 0
@@ -75,6 +82,7 @@ def _records(columns: Columns) -> bytes:
 
 def _write_las(path: Path, columns: Columns, program: str, packed: bool) -> None:
     import laspy
+    from laspy.vlrs.known import WktCoordinateSystemVlr
 
     others = dict(columns)
     xyz = np.stack([others.pop(axis).astype(np.float64) for axis in "xyz"], axis=1)
@@ -88,6 +96,8 @@ def _write_las(path: Path, columns: Columns, program: str, packed: bool) -> None
 
     header = laspy.LasHeader(point_format=LAS_FORMAT, version="1.4")
     header.generating_software = program
+    header.global_encoding.wkt = True
+    header.vlrs.append(WktCoordinateSystemVlr(LOCAL_COORDINATES))
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name, values.dtype) for name, values in others.items()]
     )
@@ -96,6 +106,8 @@ def _write_las(path: Path, columns: Columns, program: str, packed: bool) -> None
     cloud = laspy.LasData(header)
     xyz[~is_placed] = header.offsets if is_far else 0  # integers of 32 bits do not reach 0 from far
     cloud.x, cloud.y, cloud.z = xyz.T
+    cloud.return_number[:] = 1
+    cloud.number_of_returns[:] = 1
     cloud.red, cloud.green, cloud.blue = colors
     cloud.classification = classification.astype(np.uint8)
     for name, values in others.items():

@@ -20,6 +20,7 @@ import torch
 
 from amvnet.engines.export.int8 import SIMULATED, simulated_scans
 from amvnet.engines.export.onnx import OPSET, check_libraries, export
+from amvnet.engines.export.onnx_files import IR_VERSION
 from amvnet.engines.onnx import RANGE_NET, UNET, ExportedNetworks
 from amvnet.errors import InputError
 from amvnet.files import make_folder, temporary_folder, unfinished
@@ -83,7 +84,7 @@ def _key(weights: Weights, int8: bool) -> str:
     key = [*digests, repr(weights.model), version("amvnet"), torch.__version__]
     if int8:
         key.append(f"int8 {SIMULATED}")
-    return hashlib.sha256(repr((key, OPSET)).encode()).hexdigest()[:16]
+    return hashlib.sha256(repr((key, OPSET, IR_VERSION)).encode()).hexdigest()[:16]
 
 
 def _read(folder: Path, weights: Weights) -> dict[str, bytes]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from amvnet.data.datasets.base import choose_records
 from amvnet.data.datasets.open import open_dataset
-from amvnet.engines.export.onnx_files import digest, quiet, remove_notes
+from amvnet.engines.export.onnx_files import digest, finish, quiet
 from amvnet.errors import InputError
 from amvnet.files import temporary_folder
 from amvnet.onnx_runner import OnnxSegmenter, open_session
@@ -161,7 +161,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
 
     ready.unlink()
     os.replace(quantised, path)
-    remove_notes(path)
+    finish(path)
 
 
 def _first_layer(path: Path) -> list[str]:

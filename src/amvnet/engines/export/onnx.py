@@ -17,7 +17,7 @@ from amvnet.config.nested import to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.engines.base import build_model
 from amvnet.engines.export.int8 import KEEPS_FIRST_LAYER, quantise
-from amvnet.engines.export.onnx_files import digest, quiet, remove_notes
+from amvnet.engines.export.onnx_files import digest, finish, quiet
 from amvnet.errors import InputError, import_optional
 from amvnet.files import atomic_write, publish, temporary_folder
 from amvnet.models.amvnet import AMVNet
@@ -35,7 +35,7 @@ from amvnet.weights.verdict import Verdict
 GRAPH = Signature("an ONNX graph", rb"\x08.\x12.(pytorch|onnx)")
 DESCRIBED = Signature("a description of ONNX graphs", rb'\{\s*"format": ')
 LIBRARIES = ("onnx", "onnxscript", "onnxruntime")  # what the extra `export` installs
-# The lowest opset that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it.
+# The lowest opset that PyTorch's exporter writes; ONNX Runtime 1.14 is the first to read it.
 OPSET = 18
 # The largest difference from torch, of probabilities or of features that `_shares` has scaled.
 LARGEST_DIFFERENCE = 1e-4
@@ -332,7 +332,7 @@ def _convert(graph: Graph, name: str, path: Path) -> None:
         # spite of their size: by default, only small tensors count as constants.
         optimize(program.model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
         program.save(path, external_data=False)
-    remove_notes(path)
+    finish(path)
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:

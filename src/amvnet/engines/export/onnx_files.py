@@ -1,4 +1,4 @@
-"""Digest ONNX files, and silence the libraries that write them.
+"""Digest ONNX files, finish them, and silence the libraries that write them.
 
 These libraries leave notes in the files, and print warnings.
 """
@@ -12,18 +12,30 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+# The version of the file format: the last one that ONNX Runtime 1.14 reads.
+IR_VERSION = 8
+
 
 def digest(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def remove_notes(path: Path) -> None:
-    """Remove what libraries noted in a graph's file: the notes contain paths of this machine."""
+def finish(path: Path) -> None:
+    """Make a graph's file readable to ONNX Runtime 1.14, and say nothing of this machine in it.
+
+    Libraries write a later version of the file, import operators that no node uses, and note paths.
+    """
     import onnx
 
     model = onnx.load(path)
     graph = model.graph
+    model.ir_version = IR_VERSION
+    domains = {node.domain for node in graph.node}
+    opsets = [opset for opset in model.opset_import if opset.domain in domains]
+    del model.opset_import[:]
+    model.opset_import.extend(opsets)
+
     values = (*graph.initializer, *graph.value_info, *graph.input, *graph.output)
     for holder in (model, graph, *graph.node, *values):
         holder.ClearField("metadata_props")
