@@ -4,10 +4,10 @@ Load a segmenter, call it, and save or show the result:
 
     import amvnet
 
-    segmenter = amvnet.load("sim-hdl64e")  # or another of amvnet.list_weights(), or a file
-    result = segmenter("scan.pcd")         # or an array (N, 4): x, y, z, intensity in [0, 1]
-    result.save("scan.ply")                # or .pcd, .las, .laz, .npy, .label
-    amvnet.show(result)                    # in 3D, in the browser
+    segmenter = amvnet.load()       # or one of amvnet.list_weights(), or a file of weights
+    result = segmenter("scan.pcd")  # or an array (N, 4): x, y, z, intensity in [0, 1]
+    result.save("scan.ply")         # or .pcd, .las, .laz, .npy, .label
+    amvnet.show(result)             # in 3D, in the browser
 
 A result has, in the order of the points:
 

@@ -76,9 +76,7 @@ TRAIN_HEAD = TRAIN + " --stage head"
 MISTAKES = {
     "unknown command": "segment {w}/lone.bin",
     "no arguments": "predict",
-    "no weights": "predict {w}/lone.bin --out {out}",
     "no data": "train {w}/recipe.yaml --out {out}",
-    "neither weights nor predictions": "evaluate {w}/data",
     "both weights and predictions": EVALUATE + " --predictions {w}/data",
     "an argument too many": "info {w}/w.safetensors {w}/w.safetensors",
     "unknown option": PREDICT + " --colour red",

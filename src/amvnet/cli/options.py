@@ -14,17 +14,18 @@ from amvnet.engines.compute import Compute
 from amvnet.errors import InputError, listed
 from amvnet.models.methods import MethodName
 from amvnet.progress import counted
+from amvnet.sensors.lidars import AUTO, Sensor
 
 if TYPE_CHECKING:
+    from amvnet.data.class_maps import ClassMap
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.data.datasets.training_data import Source
     from amvnet.inference.drive import DriveOptions
-    from amvnet.inference.listing import ScanOptions
+    from amvnet.inference.listing import Inputs, ScanOptions
     from amvnet.inference.request import LabellingRequest
     from amvnet.inference.scores import ScorePair
     from amvnet.inference.segmenter import Segmenter
     from amvnet.runtime.distributed import Processes
-    from amvnet.sensors.lidars import Sensor
     from amvnet.weights.file import Weights
 
 # Only nuScenes has the last two splits.
@@ -33,7 +34,7 @@ SplitName = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
 # The format of label files for scan files.
 FormatName = Literal["label", "npy", "ply", "pcd", "las", "laz"]
 
-WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
+UNKNOWN = Sensor()
 MAX_SEQUENCES = 20  # largest number of sequences that a line names
 
 
@@ -313,6 +314,52 @@ def given_options(choice: Any) -> list[str]:
             text = ",".join(value) if isinstance(value, tuple) else str(value)
             words.append(flag_of(field.name) + ("" if value is True else f"={text}"))
     return words
+
+
+def load_for(
+    inputs: Inputs, weights: str, sensor: Sensor = UNKNOWN, then: str = ""
+) -> tuple[str, Weights]:
+    """Return the name of the weights for some inputs, and the weights.
+
+    If `weights` is "auto", the first recording of the inputs chooses among the built-in weights,
+    and a line reports which are chosen and why.
+
+    Args:
+        sensor: what is known about the sensor of scan files.
+        then: the end of that line.
+
+    Raises:
+        InputError: if there are no such weights.
+    """
+    from amvnet.weights.file import load
+
+    if weights == AUTO:
+        weights, reason = inputs.choose_weights(sensor)
+        report(f"weights {weights}, {reason}{then}")
+    return weights, load(weights)
+
+
+def load_dataset(
+    data: str, weights: str, mapping: ClassMap | None = None
+) -> tuple[str, Weights, Dataset]:
+    """Return the weights for a dataset by `load_for`, and the dataset, normalised to them.
+
+    Args:
+        mapping: maps the classes of the dataset and of the weights to others, so that they may
+            differ.
+
+    Raises:
+        InputError: if there are no such weights or no such dataset, or it has other classes.
+    """
+    from amvnet.data.datasets.open import open_dataset, with_classes
+    from amvnet.inference.listing import Inputs
+    from amvnet.sensors.normalise import Normaliser, normalised
+
+    dataset = open_dataset(data)
+    name, loaded = load_for(Inputs([dataset]), weights)
+    if mapping is None:
+        dataset = with_classes(dataset, loaded.taxonomy)
+    return name, loaded, normalised(dataset, Normaliser(loaded.expects))
 
 
 def load_segmenter(

@@ -23,6 +23,7 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import BAGS, FOLDER, ending_of
 from amvnet.data.formats.find import NamedScan
 from amvnet.data.formats.registry import read_file
+from amvnet.data.formats.rows import RowLayout
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -31,7 +32,7 @@ from amvnet.fleet.manifest import check_outside, split_name
 from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, results_schema
 from amvnet.fleet.secrets import without_secrets
 from amvnet.fleet.storage import Place
-from amvnet.inference.listing import FileReader, FileScan, Outcome
+from amvnet.inference.listing import FileReader, Inputs, Outcome
 from amvnet.inference.loading import load_with
 from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
@@ -40,6 +41,7 @@ from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation
 from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
+from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
 
 TRANSFERS = 8  # number of files that are fetched from object storage at the same time
@@ -116,9 +118,11 @@ class LabelScans:
         reader = _make_reader(request)
         if drive[0]["estimates"]:
             assert reader.normaliser is not None
-            reader.normaliser.recall(drive[0]["drive"], parse_estimate(drive[0]["estimates"]))
+            usual = parse_estimate(drive[0]["estimates"])
+            reader.normaliser.recall({drive[0]["drive"]: usual})
 
-        with _fetch(drive, reader, request) as (scans, folder):
+        with _fetch(drive, request.layout) as (named_scans, folder):
+            scans = reader.scans(named_scans, request.taxonomy)
             pipeline = Pipeline(
                 scans,
                 segment_by(self._segmenter, request.classes),
@@ -190,7 +194,8 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     reader = _make_reader(request, assumed.append)
     usual = None
     # A scan that cannot be read is reported as broken when it is labelled.
-    with suppress(Exception), _fetch(drive, reader, request) as (scans, _):
+    with suppress(Exception), _fetch(drive, request.layout) as (named_scans, _):
+        scans = reader.scans(named_scans, request.taxonomy)
         assert reader.normaliser is not None
         usual = reader.normaliser.measure(source).usual
         for scan, row in zip(scans, drive, strict=True):
@@ -201,14 +206,18 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     return describe_drive(source, assumed[0] if assumed else "", usual)
 
 
+def choose_weights(drive: Sequence[Row], sensor: Sensor, layout: RowLayout) -> tuple[str, str]:
+    """Return the name of built-in weights for a drive, and why, as `Inputs.choose_weights`."""
+    with _fetch(drive, layout) as (named_scans, _):
+        return Inputs([named_scans]).choose_weights(sensor)
+
+
 def _make_reader(request: LabellingRequest, report: Reporter = report_nothing) -> FileReader:
     return FileReader(Normaliser(request.weights.expects, request.sensor, report))
 
 
 @contextmanager
-def _fetch(
-    drive: Sequence[Row], reader: FileReader, request: LabellingRequest
-) -> Iterator[tuple[list[FileScan], Path]]:
+def _fetch(drive: Sequence[Row], layout: RowLayout) -> Iterator[tuple[list[NamedScan], Path]]:
     """Yield the scans of a drive and a temporary folder for labels; fetch the files ahead."""
     with temporary_folder() as temporary, ThreadPoolExecutor(TRANSFERS) as pool:
         scans = []
@@ -216,12 +225,12 @@ def _fetch(
             folder = temporary / str(index)
             place = Place.of(row["path"])
             path = place.local or folder / Path(place.path).name
-            read = partial(_read_fetched, pool.submit(place.fetch, folder), request)
+            read = partial(_read_fetched, pool.submit(place.fetch, folder), layout)
             scans.append(NamedScan(row["name"], row["drive"], path, ending="", read=read))
-        yield reader.scans(scans, request.taxonomy), temporary / "labels"
+        yield scans, temporary / "labels"
 
 
-def _read_fetched(fetching: Future[Path], request: LabellingRequest) -> Cloud:
+def _read_fetched(fetching: Future[Path], layout: RowLayout) -> Cloud:
     path = fetching.result()
     ending = ending_of(path)
     if ending in (FOLDER, *BAGS):
@@ -230,7 +239,7 @@ def _read_fetched(fetching: Future[Path], request: LabellingRequest) -> Cloud:
             f"{path}: expected a file of one scan, found {found}; name the files of scans, or "
             "segment it with amvnet predict"
         )
-    return read_file(path, ending, request.layout)
+    return read_file(path, ending, layout)
 
 
 def _complete(row: Row) -> Row:

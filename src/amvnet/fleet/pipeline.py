@@ -20,10 +20,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from amvnet.data.formats.rows import RowLayout
 from amvnet.engines.compute import Compute
 from amvnet.engines.precision import choose_precision
 from amvnet.errors import InputError, reason_of
 from amvnet.fleet.labelling import DEFAULTS, IS_FATAL, LabelScans, MeasureSensors
+from amvnet.fleet.labelling import choose_weights as choose_for_drive
 from amvnet.fleet.manifest import NameSet, list_scans
 from amvnet.fleet.results import DRIVES, DRIVES_SCHEMA, Results, describe_drive, results_schema
 from amvnet.fleet.storage import Place
@@ -32,6 +34,7 @@ from amvnet.inference.pipeline import check_faults
 from amvnet.inference.predict import report_certainty
 from amvnet.inference.request import LabellingRequest
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
+from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.measure import MEASURED_SCANS
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
@@ -115,6 +118,19 @@ def label_fleet(
     finally:
         results.flush()
     return run.finish()
+
+
+def choose_weights(
+    inputs: Sequence[str], out: str, sensor: Sensor, layout: RowLayout
+) -> tuple[str, str]:
+    """Return the name of the built-in weights for the first drive, and in words why these.
+
+    Raises:
+        InputError: if an input or the output folder cannot be used.
+    """
+    table = next(list_scans(inputs, Place.of(out)))
+    drive = table.filter(pc.equal(table["drive"], table["drive"][0]))
+    return choose_for_drive(drive.slice(0, MEASURED_SCANS).to_pylist(), sensor, layout)
 
 
 def _windows(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import overload
@@ -13,7 +13,7 @@ from typing import overload
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
-from amvnet.data.datasets.open import is_dataset, open_dataset
+from amvnet.data.datasets.open import is_dataset, open_dataset, with_classes
 from amvnet.data.formats.bag_poses import BagPoses
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
@@ -27,9 +27,14 @@ from amvnet.errors import InputError
 from amvnet.files import inside
 from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
-from amvnet.sensors.lidars import Sensor
-from amvnet.sensors.normalise import Normaliser, normalised
+from amvnet.sensors.built_in import lasers_of, weights_for
+from amvnet.sensors.lasers import SensorGeometry
+from amvnet.sensors.lidars import KNOWN_HEIGHTS, Sensor
+from amvnet.sensors.measure import MEASURED_SCANS, Estimate, Recording
+from amvnet.sensors.normalise import Normaliser, described_sensor, normalised
 from amvnet.sensors.own_body import mark_own
+
+MEASURED_HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # of a sensor whose scans lie on the ground, metres
 
 
 @dataclass(frozen=True)
@@ -281,61 +286,157 @@ class FileScan(InputScan):
 Outcome = tuple[InputScan, LoadedScan | None, Segmentation | InputError]
 
 
+class Inputs:
+    """The inputs that a user names, in their order: datasets, and the scans of files and bags.
+
+    `find_inputs` returns them, without reading a scan.
+    """
+
+    def __init__(
+        self, parts: list[Dataset | list[NamedScan]], options: ScanOptions = ScanOptions()
+    ) -> None:
+        self._parts = parts
+        self._options = options
+        self._measured: dict[str, Estimate | None] = {}  # by source, in the first part
+
+    def choose_weights(self, sensor: Sensor) -> tuple[str, str]:
+        """Return the name of built-in weights for the first recording, and in words why these.
+
+        This reads and measures the first scans; `scans` does not repeat it.
+
+        Args:
+            sensor: what is known about the sensor of scan files.
+        """
+        part = self._parts[0]
+        if isinstance(part, Dataset):
+            recordings = part.recordings()
+            if not recordings:  # nothing of a benchmark is measured
+                return weights_for(lasers_of(part.taxonomy), part.taxonomy)
+            classes = part.taxonomy
+            if part.described_sensor is not None and not sensor.is_known:
+                sensor = described_sensor(part)
+            source, scans = next(iter(recordings.items()))
+            reads = [scan.read for scan in scans]
+        else:
+            classes = None
+            source = part[0].source
+            places = [place for place, scan in enumerate(part) if scan.source == source]
+            reads = [partial(_read_for_later, part, place) for place in places]
+
+        recording = Recording(sensor, MEASURED_HEIGHT)
+        recording.learn(reads[:MEASURED_SCANS])
+        usual = recording.usual
+        # If the origin lies on the ground, the lasers were measured as if from this height.
+        if recording.is_mixed or (usual is not None and not usual.frame.is_on_ground(sensor)):
+            self._measured[source] = usual
+        lasers = SensorGeometry() if usual is None else usual.lasers
+        return weights_for(lasers.override(sensor), classes)
+
+    def scans(
+        self,
+        taxonomy: Taxonomy | None = None,
+        normaliser: Normaliser | None = None,
+        written: Taxonomy | None = None,
+        official: bool = False,
+    ) -> tuple[list[InputScan], Taxonomy]:
+        """Return all scans in their order, and the classes of their labels.
+
+        Args:
+            taxonomy: the classes of the weights, or the classes that the user names. By default, a
+                dataset has its own classes, a scan file whose name ends in `.pcd.bin` has the
+                classes of nuScenes, and any other scan file has the classes of SemanticKITTI.
+            normaliser: normalises scan files to weights; without it, they stay unchanged.
+            written: the classes of the labels that are written; by default the classes above.
+            official: whether labels are written in the official formats of datasets, in which
+                every point has a class, also of the car's own body.
+
+        Raises:
+            InputError: if the inputs have different classes, or a dataset lacks the named ones.
+        """
+        sensor = None
+        if normaliser is not None and normaliser.expected is not None and not official:
+            sensor = normaliser.sensor
+        reader = FileReader(normaliser)
+        scans: list[InputScan] = []
+        taxonomies: list[Taxonomy] = []
+        measured = self._measured
+        for part in self._parts:
+            if isinstance(part, Dataset):
+                dataset = part if taxonomy is None else with_classes(part, taxonomy)
+                if normaliser is not None:
+                    dataset = normalised(dataset, normaliser, measured)
+                options = self._options
+                for record in choose_records(dataset, options.sequences, options.split):
+                    scans.append(DatasetScan(dataset, record, written, sensor))
+                taxonomies.append(dataset.taxonomy)
+            else:
+                if normaliser is not None:
+                    normaliser.recall(measured)
+                is_nuscenes = part[0].ending == NUSCENES_ENDING
+                taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
+                scans += reader.scans(part, written or taxonomies[-1])
+            measured = {}
+
+        if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
+            raise InputError(
+                "expected inputs with the same classes, found different ones; "
+                "take them one after the other"
+            )
+        return scans, taxonomies[0]
+
+
+class _ReadOnce:
+    """Returns a cloud that was read already, and reads it if it is needed again."""
+
+    def __init__(self, cloud: Cloud, read: Callable[[], Cloud]) -> None:
+        self._cloud: Cloud | None = cloud
+        self._read = read
+
+    def __call__(self) -> Cloud:
+        cloud, self._cloud = self._cloud, None
+        return self._read() if cloud is None else cloud
+
+
+def _read_for_later(scans: list[NamedScan], place: int) -> Cloud:
+    """Read one of some scans, which will not be read again when it is needed."""
+    scan = scans[place]
+    cloud = scan.read()
+    scans[place] = replace(scan, read=_ReadOnce(cloud, scan.read))
+    return cloud
+
+
+def find_inputs(specs: Sequence[str], options: ScanOptions = ScanOptions()) -> Inputs:
+    """Return the inputs that a user names.
+
+    Args:
+        specs: each a dataset as `open_dataset` takes it, a scan file, a bag, a folder of these, or
+            a pattern as `find_scans` takes it.
+
+    Raises:
+        InputError: if an input is missing or has no scan.
+    """
+    parts: list[Dataset | list[NamedScan]] = []
+    for spec in specs:
+        if is_dataset(spec):
+            parts.append(open_dataset(spec))
+        else:
+            is_alone = len(specs) == 1
+            parts.append(list(list_scans(spec, options.topic, options.layout, is_alone)))
+    return Inputs(parts, options)
+
+
 def list_inputs(
     inputs: Sequence[str],
     options: ScanOptions = ScanOptions(),
     taxonomy: Taxonomy | None = None,
     normaliser: Normaliser | None = None,
-    written: Taxonomy | None = None,
-    official: bool = False,
 ) -> tuple[list[InputScan], Taxonomy]:
-    """List the scans of all inputs, in their order.
-
-    Args:
-        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, a folder of these, or
-            a pattern as `find_scans` takes it.
-        taxonomy: the classes of the weights, or the classes that the user names. By default, a
-            dataset has its own classes, a scan file whose name ends in `.pcd.bin` has the classes
-            of nuScenes, and any other scan file has the classes of SemanticKITTI.
-        normaliser: normalises scan files to weights; without it, they stay unchanged.
-        written: the classes of the labels that are written; by default the classes above.
-        official: whether labels are written in the official formats of datasets, in which every
-            point has a class, also of the car's own body.
-
-    Returns:
-        The scans, and the classes of their labels.
+    """List the scans of all inputs, in their order, as `Inputs.scans` returns them.
 
     Raises:
-        InputError: if an input is missing or has no scan, or the inputs have different classes.
+        InputError: as `find_inputs` and `Inputs.scans`.
     """
-    reader = FileReader(normaliser)
-    sensor = None
-    if normaliser is not None and normaliser.expected is not None and not official:
-        sensor = normaliser.sensor
-    scans: list[InputScan] = []
-    taxonomies: list[Taxonomy] = []
-    for spec in inputs:
-        if is_dataset(spec):
-            dataset = open_dataset(spec, taxonomy)
-            if normaliser is not None:
-                dataset = normalised(dataset, normaliser)
-            for record in choose_records(dataset, options.sequences, options.split):
-                scans.append(DatasetScan(dataset, record, written, sensor))
-            taxonomies.append(dataset.taxonomy)
-            continue
-
-        is_alone = len(inputs) == 1
-        named_scans = list(list_scans(spec, options.topic, options.layout, is_alone))
-        is_nuscenes = named_scans[0].ending == NUSCENES_ENDING
-        taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
-        scans += reader.scans(named_scans, written or taxonomies[-1])
-
-    if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
-        raise InputError(
-            "expected inputs with the same classes, found different ones; "
-            "take them one after the other"
-        )
-    return scans, taxonomies[0]
+    return find_inputs(inputs, options).scans(taxonomy, normaliser)
 
 
 class Scans(Sequence[Scan]):

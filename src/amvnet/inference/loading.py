@@ -13,16 +13,18 @@ from amvnet.engines.export.cache import cached_networks
 from amvnet.engines.onnx import OnnxEngine
 from amvnet.engines.precision import resolved
 from amvnet.engines.torch import TorchEngine
+from amvnet.inference.choosing import ChoosingSegmenter
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method
 from amvnet.progress import Reporter, report_nothing
-from amvnet.sensors.lidars import make_sensor
-from amvnet.weights.file import Weights
+from amvnet.sensors.lidars import AUTO, make_sensor
+from amvnet.weights.file import PARTS, Weights
 from amvnet.weights.file import load as load_weights
 
 
 def load(
-    weights: Weights | Path | str,
+    weights: Weights | Path | str = AUTO,
     device: str = "auto",
     method: MethodName = "amvnet",
     precision: Precision = "auto",
@@ -46,7 +48,9 @@ def load(
 
     Args:
         weights: trained weights, the path of a weights file, the name of built-in weights
-            (`sim-hdl64e`, `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
+            (`list_weights`), weights on the hub (`hf-hub:OWNER/NAME`), or "auto": the lasers of the
+            first scan then choose the built-in weights, which label all scans. Until then, the
+            segmenter has no weights and no classes.
         device: the device to compute on: "cpu", "cuda", "cuda:1", ..., or "auto", which is "cuda"
             if there is a GPU and the engine is "torch", else "cpu".
         method: "amvnet", or for comparison "rv" or "bev" (one network), "rv-knn" (the range view
@@ -76,7 +80,19 @@ def load(
     described = make_sensor(sensor, height=height, keep_own=keep_own or None)
     parse_layout(columns)  # before the networks are loaded, which takes long
     compute = Compute(device, engine, precision)
-    segmenter = load_with(compute, weights, method, tau, graphs=graphs, report=report)
+
+    def load_named(weights: Weights | Path | str) -> Segmenter:
+        return load_with(compute, weights, method, tau, graphs=graphs, report=report)
+
+    segmenter: Segmenter
+    if weights == AUTO:
+        compute = resolved(compute)  # what can be checked before the first scan
+        check_method(method, PARTS)
+        if tau is not None:
+            Disagreement(tau)
+        segmenter = ChoosingSegmenter(load_named, report)
+    else:
+        segmenter = load_named(weights)
     segmenter.sensor = described
     segmenter.columns = columns
     return segmenter

@@ -9,7 +9,7 @@ from dataclasses import replace
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.drive import DriveOptions, Drives, find_poses, key_of
 from amvnet.inference.journal import Entry
-from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
+from amvnet.inference.listing import Inputs, InputScan
 from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_output
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation
@@ -28,11 +28,10 @@ ADVICE = (
 
 
 def predict(
-    inputs: Sequence[str],
+    inputs: Inputs,
     request: LabellingRequest,
     make_segmenter: Callable[[], Segmenter],
     output: OutputOptions,
-    options: ScanOptions,
     *,
     drive: DriveOptions | None = None,
     batch: int = 1,
@@ -55,14 +54,13 @@ def predict(
         a line for each scan that is broken.
 
     Raises:
-        InputError: before anything is written, if an input is missing, or `check_output` raises it.
+        InputError: before anything is written, if an input has other classes, or `check_output`
+            raises it.
     """
     classes = request.classes
     normaliser = Normaliser(request.weights.expects, request.sensor, report)
     written = None if classes is None else classes.target
-    scans, _ = list_inputs(
-        inputs, options, request.weights.taxonomy, normaliser, written, official=True
-    )
+    scans, _ = inputs.scans(request.weights.taxonomy, normaliser, written, official=True)
     check_output(scans, output)
     drives = None
     if drive is not None:

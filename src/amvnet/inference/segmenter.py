@@ -8,12 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from amvnet.data.datasets.open import is_dataset
-from amvnet.data.formats.find import list_scans
 from amvnet.data.formats.rows import parse_layout
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
-from amvnet.inference.listing import FileReader, InputScan, ScanOptions, list_inputs
+from amvnet.inference.listing import Inputs, InputScan, ScanOptions, find_inputs
 from amvnet.inference.reading import array_cloud, array_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
@@ -127,9 +126,8 @@ class Segmenter:
                 f"{points}: expected one scan, found a dataset; segment its scans with "
                 "Segmenter.each"
             )
-        normaliser, assumed = self._normaliser()
-        named = list_scans(points, layout=parse_layout(columns or self.columns))
-        scans = FileReader(normaliser).scans(named, self.taxonomy)
+        layout = parse_layout(columns or self.columns)
+        scans, assumed = self._list(find_inputs([str(points)], ScanOptions(layout=layout)))
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
@@ -202,10 +200,15 @@ class Segmenter:
             InputError: if there is no scan. The iterator raises it if a scan cannot be read or
                 segmented.
         """
-        normaliser, assumed = self._normaliser()
         options = ScanOptions(topic=topic, layout=parse_layout(self.columns))
-        scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
+        scans, assumed = self._list(find_inputs([str(path)], options))
         return (self._segment_input(scan, assumed) for scan in scans)
+
+    def _list(self, inputs: Inputs) -> tuple[list[InputScan], list[str]]:
+        """Return the scans of some inputs, and the list of what is assumed of their sensors."""
+        normaliser, assumed = self._normaliser()
+        scans, _ = inputs.scans(self.taxonomy, normaliser)
+        return scans, assumed
 
     def _normaliser(self) -> tuple[Normaliser, list[str]]:
         """Return a normaliser, and the list of what it assumes of the sensors of the scans."""

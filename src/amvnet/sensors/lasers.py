@@ -86,6 +86,14 @@ def _is_near(angle: float | None, other: float | None) -> bool:
     return angle is None or other is None or abs(angle - other) <= SAME_ANGLE
 
 
+def describe_lasers(lasers: SensorGeometry) -> str:
+    """Return the number of lasers and the field of view in words."""
+    count = "lasers" if lasers.beams is None else f"{lasers.beams} lasers"
+    if lasers.fov_up is None or lasers.fov_down is None:
+        return count if lasers.beams else "field of view not found"
+    return f"{count} from {lasers.fov_up:+.0f} to {lasers.fov_down:+.0f} degrees"
+
+
 def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:
     """Measure the sensor of a scan; values that the points do not show are None.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -15,19 +15,13 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import Scan
+from amvnet.sensors.built_in import suited_to
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.frame import MAX_SENSOR_HEIGHT, Frame
 from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
 from amvnet.sensors.laser_order import lasers_by_order
-from amvnet.sensors.lasers import SensorGeometry, elevations
-from amvnet.sensors.lidars import (
-    BUILT_IN,
-    KNOWN_SENSORS,
-    UNITS,
-    Sensor,
-    make_sensor,
-    rotation_from_degrees,
-)
+from amvnet.sensors.lasers import SensorGeometry, describe_lasers, elevations
+from amvnet.sensors.lidars import UNITS, Sensor, make_sensor, rotation_from_degrees
 from amvnet.sensors.measure import (
     MEASURED_SCANS,
     Estimate,
@@ -99,17 +93,8 @@ def describe(
     name = trained.name or "a sensor"
     return (
         f"{line}; the weights were trained for {name} ({describe_lasers(expected.lasers)}) "
-        f"and have seen no such sensor; {_suited_to(lasers)}"
+        f"and have seen no such sensor; {suited_to(lasers)}"
     )
-
-
-def _suited_to(lasers: SensorGeometry) -> str:
-    """Return in words which built-in weights have seen such lasers."""
-    names = []
-    for name, sensor in BUILT_IN.items():
-        if lasers.is_like(SensorGeometry().override(KNOWN_SENSORS[sensor])):
-            names.append(name)
-    return f"{' and '.join(names)} would fit" if names else "no built-in weights have"
 
 
 class Normaliser:
@@ -194,9 +179,10 @@ class Normaliser:
             self._begin(source).learn(self._first.pop(source, []))
         return self._recordings[source]
 
-    def recall(self, source: str, usual: Estimate | None) -> None:
-        """Normalise the scans of a source by the estimate that another process has measured."""
-        self._begin(source).recall(usual)
+    def recall(self, measured: Mapping[str, Estimate | None]) -> None:
+        """Normalise the scans of some sources by estimates that were measured before."""
+        for source, usual in measured.items():
+            self._begin(source).recall(usual)
 
     def _begin(self, source: str) -> Recording:
         assert self.expected is not None
@@ -257,7 +243,9 @@ class Normaliser:
         return scan
 
 
-def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
+def normalised(
+    dataset: Dataset, normaliser: Normaliser, measured: Mapping[str, Estimate | None] = {}
+) -> Dataset:
     """Return a dataset whose scans are normalised as scan files are.
 
     Only a user's own scans are changed: the scans of the benchmarks stay unchanged, because weights
@@ -266,6 +254,7 @@ def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
     Args:
         normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML
             file says of it counts.
+        measured: estimates of recordings that were measured before.
 
     Raises:
         InputError: if the YAML file describes an impossible sensor.
@@ -276,6 +265,7 @@ def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
     for source, scans in dataset.recordings().items():
         for scan in scans:
             normaliser.expect(source, scan.read)
+    normaliser.recall(measured)
     return dataset.normalised_by(normaliser)
 
 
@@ -449,11 +439,3 @@ def _describe_height(frame: Frame, sensor: Sensor, usual_height: float | None) -
     if rise:
         text += f" (moved by {rise:+.2f} m to {usual_height:.2f} m)"
     return text
-
-
-def describe_lasers(lasers: SensorGeometry) -> str:
-    """Return the number of lasers and the field of view in words."""
-    count = "lasers" if lasers.beams is None else f"{lasers.beams} lasers"
-    if lasers.fov_up is None or lasers.fov_down is None:
-        return count if lasers.beams else "field of view not found"
-    return f"{count} from {lasers.fov_up:+.0f} to {lasers.fov_down:+.0f} degrees"

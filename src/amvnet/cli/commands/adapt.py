@@ -7,10 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import on_terminal, progress, report
-from amvnet.cli.options import LabelledChoice, ScanChoice, SensorChoice, load_segmenter
+from amvnet.cli.options import (
+    LabelledChoice,
+    ScanChoice,
+    SensorChoice,
+    load_for,
+    load_segmenter,
+)
 from amvnet.config.bounds import Count, Seed, Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
+from amvnet.sensors.lidars import AUTO
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset
@@ -22,11 +29,11 @@ if TYPE_CHECKING:
 def adapt(
     inputs: list[str],
     /,
-    weights: str,
     out: Path,
     choice: ScanChoice,
     sensor_choice: SensorChoice,
     compute: Compute,
+    weights: str = AUTO,
     poses: Path | None = None,
     loose: bool = False,
     epochs: Count | None = None,
@@ -40,12 +47,13 @@ def adapt(
 
     Args:
         inputs: the scans of one or several drives: datasets, bags, folders or patterns.
-        weights: the weights that label the drive, and that the training begins with: a weights
-            file with both networks, or the name of built-in weights.
         out: folder of the run; it then holds the adapted weights.
         choice: which scans of the inputs to use.
         sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
+        weights: the weights that label the drive, and that the training begins with: a weights
+            file with both networks, the name of built-in weights, or auto, for the built-in
+            weights that suit the lasers.
         poses: the poses of the LiDAR, as predict takes them; default: the dataset's, or estimated
             by KISS-ICP.
         loose: the scans are no drive; each teaches by its own labels.
@@ -63,23 +71,22 @@ def adapt(
     from amvnet.data.datasets.simulated import SimulatedStreets
     from amvnet.data.datasets.training_data import Source, TrainingData
     from amvnet.inference.drive import digest_of, find_poses
-    from amvnet.inference.listing import list_inputs
+    from amvnet.inference.listing import find_inputs
     from amvnet.models.methods import check_method
     from amvnet.sensors.normalise import Normaliser
     from amvnet.training.adapt import adapt as adapt_weights
     from amvnet.training.adapt import recipe_for
     from amvnet.training.plan import Plan
-    from amvnet.weights.file import load
 
     if loose and poses:
         raise InputError("--poses: expected no --loose, whose scans are no drive; leave one out")
     if val_sequences and not val:
         raise InputError("--val-sequences: expected --val, found none; add it")
-    loaded = load(weights)
-    check_method("amvnet", loaded.parts)
     sensor, options = sensor_choice.parse(), choice.parse()
-    normaliser = Normaliser(loaded.expects, sensor, report)
-    scans, _ = list_inputs(inputs, options, loaded.taxonomy, normaliser)
+    found = find_inputs(inputs, options)
+    weights, loaded = load_for(found, weights, sensor)
+    check_method("amvnet", loaded.parts)
+    scans, _ = found.scans(loaded.taxonomy, Normaliser(loaded.expects, sensor, report))
     recipe = recipe_for(loaded, epochs, streets, seed)
     drives = None
     if not loose:

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import LabelledChoice, load_segmenter
+from amvnet.cli.options import LabelledChoice, load_dataset, load_segmenter
 from amvnet.config.bounds import Range, Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
 from amvnet.progress import counted
+from amvnet.sensors.lidars import AUTO
 
 Neighbours = Annotated[int, Range(1, 1000)]
 
@@ -19,10 +20,10 @@ Neighbours = Annotated[int, Range(1, 1000)]
 def analyze(
     data: str,
     /,
-    weights: str,
     out: Path,
     choice: LabelledChoice,
     compute: Compute,
+    weights: str = AUTO,
     neighbours: tuple[Neighbours, ...] | None = None,
     taus: tuple[Share, ...] | None = None,
     recipe: str | None = None,
@@ -33,10 +34,11 @@ def analyze(
 
     Args:
         data: the dataset, with labels.
-        weights: a weights file, or the name of built-in weights.
         out: folder for the diagrams (PNG), and the numbers that they show (CSV).
         choice: which scans to score.
         compute: where and how the networks are computed.
+        weights: a weights file, the name of built-in weights, or auto, for the built-in weights
+            that suit the lasers.
         neighbours: numbers of neighbours, separated by commas; a head is trained for each of them
             (Fig. 8b); needs --recipe.
         taus: thresholds, separated by commas; a head is trained for each of them (Fig. 8a); with
@@ -48,16 +50,13 @@ def analyze(
     """
     from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.open import open_dataset
     from amvnet.data.datasets.training_data import Source, TrainingData
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
     from amvnet.outputs import check_outputs
-    from amvnet.sensors.normalise import Normaliser, normalised
     from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
     from amvnet.training.plan import Plan
-    from amvnet.weights.file import load
 
     has_values = neighbours is not None or taus is not None
     if has_values != (recipe is not None):
@@ -65,8 +64,7 @@ def analyze(
             "expected --neighbours or --taus together with --recipe, found only one of them; "
             "give both or neither"
         )
-    loaded = load(weights)
-    dataset = normalised(open_dataset(data, loaded.taxonomy), Normaliser(loaded.expects))
+    weights, loaded, dataset = load_dataset(data, weights)
     records = choice.records(dataset)
 
     # Check the outputs and the training scans first: scoring takes long, and would be for nothing

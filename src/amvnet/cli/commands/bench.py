@@ -6,14 +6,15 @@ from json import dumps
 from pathlib import Path
 
 from amvnet.cli.console import progress, show
-from amvnet.cli.options import WEIGHTS, load_segmenter
+from amvnet.cli.options import load_for, load_segmenter
 from amvnet.config.bounds import Count, Share
 from amvnet.engines.compute import Compute
+from amvnet.sensors.lidars import AUTO
 
 
 def bench(
     compute: Compute,
-    weights: str = WEIGHTS,
+    weights: str = AUTO,
     scan: Path | None = None,
     runs: Count = 10,
     tau: Share | None = None,
@@ -24,7 +25,8 @@ def bench(
 
     Args:
         compute: where and how the networks are computed; one scan is timed at a time.
-        weights: a weights file, or the name of built-in weights.
+        weights: a weights file, the name of built-in weights, or auto, for the built-in weights
+            that suit the lasers.
         scan: the file of the scan; default: a simulated scan.
         runs: the number of timed runs, after two warm-up runs; the table shows medians and
             quartiles.
@@ -38,6 +40,7 @@ def bench(
     from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
     from amvnet.files import atomic_write, temporary_folder
+    from amvnet.inference.listing import find_inputs
     from amvnet.inference.timing import FIGURES, time_runs
     from amvnet.outputs import check_outputs
 
@@ -45,12 +48,13 @@ def bench(
         check_outputs({json: FIGURES}, [weights, scan], overwrite)
     if scan is not None:
         read_cloud(scan)  # reports a broken scan before the networks are loaded
-    segmenter = load_segmenter(weights, "amvnet", compute, tau)
 
     with temporary_folder() as folder:
         if scan is None:
             simulate(folder, scans=1)
             scan = folder / "sequences/00/velodyne/000000.bin"
+        _, loaded = load_for(find_inputs([str(scan)]), weights)
+        segmenter = load_segmenter(loaded, "amvnet", compute, tau)
 
         with progress("timing") as step:
             report = time_runs(

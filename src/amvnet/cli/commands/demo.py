@@ -6,8 +6,8 @@ from pathlib import Path
 
 from amvnet.cli.commands.evaluate import show_evaluation
 from amvnet.cli.console import progress, report, report_lines
-from amvnet.cli.options import WEIGHTS
 from amvnet.config.bounds import Seed
+from amvnet.sensors.lidars import AUTO
 
 SEED = 20_201_209  # the default seed, far from the seeds of the built-in weights' training streets
 SCANS = 2  # number of scans of each street
@@ -21,29 +21,33 @@ IoU says how well a class is found; accuracy is the share of points with the rig
 
 
 def demo(
-    out: Path = Path("demo"), seed: Seed = SEED, weights: str = WEIGHTS, overwrite: bool = False
+    out: Path = Path("demo"), seed: Seed = SEED, weights: str = AUTO, overwrite: bool = False
 ) -> None:
     """Simulate streets, segment them, score the labels, and write a page that shows them in 3D.
 
     Args:
         out: folder for the scans, the page (index.html) and the scores (metrics.json).
         seed: the seed of the streets; the built-in weights have not seen the default streets.
-        weights: a weights file, or the name of built-in weights.
+        weights: a weights file, the name of built-in weights, or auto, for those of the lasers of
+            SemanticKITTI.
         overwrite: replace the page and the scores if they exist.
     """
     from amvnet.data.datasets.simulated import simulate
-    from amvnet.data.taxonomy import CLASSES_BY_SENSOR
+    from amvnet.data.taxonomy import CLASSES_BY_SENSOR, SEMANTICKITTI
     from amvnet.errors import InputError
     from amvnet.evaluation.metrics import REPORT
     from amvnet.inference.listing import list_inputs
     from amvnet.inference.loading import load
     from amvnet.outputs import check_outputs
+    from amvnet.sensors.built_in import lasers_of, weights_for
     from amvnet.viewing.page import PAGE, write_page
     from amvnet.viewing.shown_scans import show_scans
 
     page = out / "index.html"
     metrics_path = out / "metrics.json"
     check_outputs({page: PAGE, metrics_path: REPORT}, [weights], overwrite)
+    if weights == AUTO:
+        weights, _ = weights_for(lasers_of(SEMANTICKITTI))
     segmenter = load(weights)
     classes = segmenter.taxonomy.classes
     sensors = [name for name, taxonomy in CLASSES_BY_SENSOR.items() if taxonomy.classes == classes]

@@ -9,11 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report, show
-from amvnet.cli.options import DriveChoice, LabelledChoice, join_processes, load_segmenter
+from amvnet.cli.options import (
+    DriveChoice,
+    LabelledChoice,
+    join_processes,
+    load_dataset,
+    load_segmenter,
+)
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
 from amvnet.models.methods import PAPER_METHODS, MethodName, check_method, methods_of, widest_method
+from amvnet.sensors.lidars import AUTO
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
@@ -44,7 +51,8 @@ def evaluate(
         compute: where and how the networks are computed.
         drive_choice: with --weights, whether to also score the fusion over time, as the method
             drive.
-        weights: a weights file, or the name of built-in weights.
+        weights: a weights file, or the name of built-in weights; default: the built-in weights that
+            suit the lasers.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
         methods: with --weights, the methods to score, separated by commas; rv-knn is rv with a vote
             of neighbours in the range image, arithmetic and maximum are the other ensembles.
@@ -65,8 +73,6 @@ def evaluate(
     from amvnet.evaluation.scoring import label_by_weights, label_from_files, pictures_of
     from amvnet.files import make_folder
     from amvnet.outputs import check_outputs
-    from amvnet.sensors.normalise import Normaliser, normalised
-    from amvnet.weights.file import load
 
     def check_files(records: Sequence[ScanRecord]) -> None:
         """Check that all files can be written, before time is spent on networks and scans."""
@@ -78,14 +84,10 @@ def evaluate(
     processes = join_processes()
     drives = None
     mapping = None if classes is None else class_map(classes)
-    if (weights is None) == (predictions is None):
-        raise InputError(
-            "expected either --weights or --predictions, found both or neither; give one of them"
-        )
-    if weights is not None:
-        loaded = load(weights)
-        opened = open_dataset(data, loaded.taxonomy if mapping is None else None)
-        dataset = normalised(opened, Normaliser(loaded.expects))
+    if weights is not None and predictions is not None:
+        raise InputError("expected --weights or --predictions, found both; give one of them")
+    if predictions is None:
+        weights, loaded, dataset = load_dataset(data, weights or AUTO, mapping)
         records = choice.records(dataset)
         check_files(records)
         drives = _find_drives(drive_choice, dataset, records, processes.size)
@@ -96,7 +98,7 @@ def evaluate(
         compute = replace(compute, device=device)
         segmenter = load_segmenter(loaded, widest_method(parts), compute, tau)
         labeller = label_by_weights(dataset, segmenter, methods, mapping)
-    elif predictions is not None:
+    else:
         for flag, is_given in (("--tau", tau is not None), ("--drive", drive_choice.drive)):
             if is_given:
                 raise InputError(

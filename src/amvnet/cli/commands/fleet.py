@@ -8,16 +8,17 @@ from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
 from amvnet.errors import import_optional
 from amvnet.progress import counted
+from amvnet.sensors.lidars import AUTO
 
 
 def fleet(
     inputs: list[str],
     /,
-    weights: str,
     out: str,
     sensor_choice: SensorChoice,
     compute: Compute,
     labels: LabelChoice,
+    weights: str = AUTO,
     columns: str | None = None,
     dtype: str | None = None,
     batch: Count = 1,
@@ -29,11 +30,12 @@ def fleet(
 
     Args:
         inputs: folders of scan files, scan files, or manifests (.parquet, .csv): URLs or paths.
-        weights: a weights file, or the name of built-in weights.
         out: folder for the labels, a URL or a path; it must be new unless --resume is given.
         sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
         labels: how points are labelled, and which files are written.
+        weights: a weights file, the name of built-in weights, or auto, for the built-in weights
+            that suit the lasers of the first drive.
         columns: the columns of .bin, .npy and text files in their order, as predict takes them.
         dtype: the type of the numbers in .bin files, as predict takes it.
         batch: number of scans that go through the networks together; more than one suits a GPU.
@@ -47,6 +49,10 @@ def fleet(
 
     pipeline = import_optional("amvnet.fleet.pipeline", "fleet")
     choice = ScanChoice(columns=columns, dtype=dtype)
+    if weights == AUTO:
+        sensor, layout = sensor_choice.parse(), choice.parse().layout
+        weights, reason = pipeline.choose_weights(inputs, out, sensor, layout)
+        report(f"weights {weights}, {reason}")
     request = labels.parse(load(weights), choice, sensor_choice, compute)
     with progress("labelling") as step:
         written = pipeline.label_fleet(

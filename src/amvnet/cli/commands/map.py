@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
+from amvnet.cli.options import ScanChoice, SensorChoice, load_for, load_segmenter
 from amvnet.config.bounds import Range
 from amvnet.engines.compute import Compute
 from amvnet.progress import counted
+from amvnet.sensors.lidars import AUTO
 
 SHOWN_CLASSES = 4  # number of classes in the line about the map
 
@@ -18,11 +19,11 @@ SHOWN_CLASSES = 4  # number of classes in the line about the map
 def map(
     inputs: str,
     /,
-    weights: str,
     out: Path,
     choice: ScanChoice,
     sensor_choice: SensorChoice,
     compute: Compute,
+    weights: str = AUTO,
     poses: Path | None = None,
     voxel: Annotated[float, Range(0.02, 10)] = 0.2,
     keep_movable: bool = False,
@@ -34,12 +35,13 @@ def map(
 
     Args:
         inputs: the scans of a drive: a dataset with --sequences, a bag, a folder or a pattern.
-        weights: a weights file, or the name of built-in weights.
         out: the map, FILE.ply, FILE.las or FILE.laz: a point for each voxel, with its class, its
             confidence and the number of scans that saw it.
         choice: which scans of the input to use.
         sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
+        weights: a weights file, the name of built-in weights, or auto, for the built-in weights
+            that suit the lasers.
         poses: the poses of the LiDAR, as predict takes them; default: the dataset's, or estimated
             by KISS-ICP.
         voxel: edge of the voxels, metres.
@@ -51,20 +53,19 @@ def map(
     from amvnet.drives.world_map import FIGURES, SIGNATURES, MapBuilder, check_ending
     from amvnet.files import atomic_write, make_folder
     from amvnet.inference.drive import digest_of, find_poses
-    from amvnet.inference.listing import list_inputs
+    from amvnet.inference.listing import find_inputs
     from amvnet.inference.map import SavedMap, describe_map, map_drive
     from amvnet.outputs import check_outputs
     from amvnet.sensors.normalise import Normaliser
-    from amvnet.weights.file import load
 
     check_ending(out)
     outputs = {out: SIGNATURES[out.suffix]}
     if json is not None:
         outputs[json] = FIGURES
-    loaded = load(weights)
     sensor, options = sensor_choice.parse(), choice.parse()
-    normaliser = Normaliser(loaded.expects, sensor, report)
-    scans, _ = list_inputs([inputs], options, loaded.taxonomy, normaliser)
+    found = find_inputs([inputs], options)
+    weights, loaded = load_for(found, weights, sensor)
+    scans, _ = found.scans(loaded.taxonomy, Normaliser(loaded.expects, sensor, report))
     files = [path for scan in scans for path in scan.files]
     check_outputs(outputs, [*files, weights, poses], overwrite)
     with progress("poses") as step:

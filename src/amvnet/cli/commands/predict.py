@@ -13,12 +13,14 @@ from amvnet.cli.options import (
     ScanChoice,
     SensorChoice,
     given_options,
+    load_for,
     load_segmenter,
 )
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
 from amvnet.progress import counted
+from amvnet.sensors.lidars import AUTO
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
@@ -28,13 +30,13 @@ if TYPE_CHECKING:
 def predict(
     inputs: list[str],
     /,
-    weights: str,
-    out: str,
     choice: ScanChoice,
     sensor_choice: SensorChoice,
     compute: Compute,
     labels: LabelChoice,
     drive_choice: DriveChoice,
+    weights: str = AUTO,
+    out: str = "labels",
     batch: Count = 1,
     resume: bool = False,
     overwrite: bool = False,
@@ -43,13 +45,14 @@ def predict(
 
     Args:
         inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
-        weights: a weights file, or the name of built-in weights.
-        out: folder for the labels.
         choice: which scans of the inputs to segment.
         sensor_choice: what is known about the sensor of scan files.
         compute: where and how the networks are computed.
         labels: how points are labelled, and which files are written.
         drive_choice: whether the scores of drives are fused over time.
+        weights: a weights file, the name of built-in weights, or auto, for the built-in weights
+            that suit the lasers.
+        out: folder for the labels.
         batch: number of scans that go through the networks together; more than one suits a GPU.
         resume: continue an earlier run in the folder, with the same weights and options; segment
             only scans that are new or were not finished.
@@ -57,16 +60,20 @@ def predict(
     """
     from amvnet.cli.tables import labelled_table
     from amvnet.engines.precision import resolved
+    from amvnet.inference.listing import find_inputs
     from amvnet.inference.pipeline import check_faults
     from amvnet.inference.predict import predict as predict_inputs
     from amvnet.inference.predict import report_certainty
-    from amvnet.weights.file import load
 
     for text in (*inputs, out):
         if "://" in text:
             raise InputError(f"{text}: expected a path, found a URL; use amvnet fleet")
     compute = resolved(compute)  # the labels depend on what "auto" is
-    request = labels.parse(load(weights), choice, sensor_choice, compute)
+    drive = drive_choice.parse()
+    found = find_inputs(inputs, choice.parse())
+    where = f"; labels go to {out}"
+    weights, loaded = load_for(found, weights, sensor_choice.parse(), where)
+    request = labels.parse(loaded, choice, sensor_choice, compute)
     also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, drive_choice.poses)
 
     def make_segmenter() -> Segmenter:
@@ -74,12 +81,11 @@ def predict(
 
     with progress("segmenting") as step:
         entries, faults = predict_inputs(
-            inputs,
+            found,
             request,
             make_segmenter,
             request.output(Path(out), overwrite, resume, also_read),
-            choice.parse(),
-            drive=drive_choice.parse(),
+            drive=drive,
             batch=batch,
             progress=step,
             report=report,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
+from amvnet.cli.options import ScanChoice, SensorChoice, load_for, load_segmenter
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -36,8 +36,8 @@ def view(
         compute: where and how the networks are computed.
         labels: a folder of labels as predict writes them, in any of its formats, or the label file
             of a single scan.
-        weights: a weights file, or the name of built-in weights, instead of labels. The page then
-            shows the labels of every method.
+        weights: a weights file, the name of built-in weights, or auto, for the built-in weights
+            that suit the lasers, instead of labels. The page then shows the labels of every method.
         html: the page to write, which gets the ending .html if it has none; default: a temporary
             page, which opens in the browser.
         scans: largest number of scans; they are evenly spaced in the inputs.
@@ -47,12 +47,11 @@ def view(
     from amvnet.data.spacing import evenly_spaced
     from amvnet.data.taxonomy import TAXONOMIES
     from amvnet.files import make_folder
-    from amvnet.inference.listing import list_inputs
+    from amvnet.inference.listing import find_inputs
     from amvnet.outputs import check_outputs
     from amvnet.sensors.normalise import Normaliser
     from amvnet.viewing.page import PAGE, open_page, page_name, place_for_page, write_page
     from amvnet.viewing.shown_scans import check_labels, show_scans
-    from amvnet.weights.file import load
 
     if labels is not None and weights is not None:
         raise InputError("expected --labels or --weights, found both; give one of them")
@@ -69,13 +68,15 @@ def view(
         make_folder(html.parent)
 
     classes = None if taxonomy is None else TAXONOMIES[taxonomy]
+    found = find_inputs(inputs, choice.parse())
     normaliser = Normaliser(None, sensor, report)
-    loaded = None if weights is None else load(weights)
-    if loaded is not None:
+    loaded = None
+    if weights is not None:
+        weights, loaded = load_for(found, weights, sensor)
         classes = loaded.taxonomy
         normaliser = Normaliser(loaded.expects, sensor, report)
 
-    listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser)
+    listed, classes = found.scans(classes, normaliser)
     if labels is not None:
         check_labels(labels, len(listed))
     segmenter = None

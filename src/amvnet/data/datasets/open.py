@@ -38,7 +38,16 @@ def open_dataset(spec: str, classes: Taxonomy | None = None) -> Dataset:
             classes.
     """
     dataset = _open(spec)
-    if classes is None or dataset.taxonomy.classes == classes.classes:
+    return dataset if classes is None else with_classes(dataset, classes)
+
+
+def with_classes(dataset: Dataset, classes: Taxonomy) -> Dataset:
+    """Return a dataset with some classes, as `open_dataset` opens it.
+
+    Raises:
+        InputError: if the dataset has other classes.
+    """
+    if dataset.taxonomy.classes == classes.classes:
         return dataset
     if isinstance(dataset, OwnScans):
         return dataset.with_classes(classes)

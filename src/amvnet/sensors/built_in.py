@@ -1,0 +1,51 @@
+"""Choose built-in weights by the lasers of a sensor."""
+
+from __future__ import annotations
+
+from amvnet.data.taxonomy import CLASSES_BY_SENSOR, SEMANTICKITTI, Taxonomy
+from amvnet.sensors.lasers import SensorGeometry, describe_lasers
+from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, Sensor
+
+
+def weights_for(lasers: SensorGeometry, classes: Taxonomy | None = None) -> tuple[str, str]:
+    """Return the name of the built-in weights for a sensor, and in words why these.
+
+    Args:
+        lasers: what is known about the lasers of the sensor.
+        classes: the classes of a dataset; weights with other classes are left out if any have them.
+    """
+    names = [name for name in BUILT_IN if classes is None or _has_classes(name, classes)]
+    names = names or list(BUILT_IN)
+    if lasers.field_of_view is None:
+        return names[-1], "as the lasers are unknown"
+    fitting = [name for name in _fitting(lasers) if name in names]
+    if fitting:
+        return fitting[0], f"trained for such lasers ({describe_lasers(lasers)})"
+    return names[-1], f"as none were trained for such lasers ({describe_lasers(lasers)})"
+
+
+def suited_to(lasers: SensorGeometry) -> str:
+    """Return in words which built-in weights have seen such lasers."""
+    names = _fitting(lasers)
+    return f"{' and '.join(names)} would fit" if names else "no built-in weights have"
+
+
+def lasers_of(classes: Taxonomy) -> SensorGeometry:
+    """Return the lasers that recorded the benchmark with these classes; unknown for others."""
+    for name, taxonomy in CLASSES_BY_SENSOR.items():
+        if taxonomy.classes == classes.classes:
+            return SensorGeometry().override(KNOWN_SENSORS[name])
+    return SensorGeometry()
+
+
+def _fitting(lasers: SensorGeometry) -> list[str]:
+    """Return the names of the built-in weights that have seen such lasers."""
+    return [name for name in BUILT_IN if lasers.is_like(_trained_lasers(name))]
+
+
+def _trained_lasers(name: str) -> SensorGeometry:
+    return SensorGeometry().override(KNOWN_SENSORS.get(BUILT_IN[name], Sensor()))
+
+
+def _has_classes(name: str, classes: Taxonomy) -> bool:
+    return CLASSES_BY_SENSOR.get(BUILT_IN[name], SEMANTICKITTI).classes == classes.classes
