@@ -7,13 +7,19 @@ PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 # The least share of lines that `make test-full COVERAGE=1` must run, in percent: raise it to two points below what CI prints.
 COVERAGE_FLOOR := 90
+define NEXT
+printf '%s\n' "type next:" "  source .venv/bin/activate   # once in each shell, so that it finds amvnet" \
+    "  amvnet predict scan.bin     # label a scan of yours"
+endef
 
 .PHONY: install demo test test-full all-tests bench gpu docs style lint format release clean
 
 install: .venv/installed  ## the package and all that its tests need, in .venv
+	@$(NEXT)
 
 demo: .venv/installed  ## simulate streets, segment and score them, and show all in demo/index.html
 	$(BIN)/amvnet demo --out demo --overwrite
+	@$(NEXT)
 
 test: style  ## style, and the tests of each change: about 4 minutes on two cores
 	$(PYTEST)
@@ -33,7 +39,7 @@ gpu: .venv/installed  ## on a machine with a GPU: its tests and its tables, to p
 	$(BIN)/python benchmarks/gpu.py $(SCAN)
 
 docs: .venv/docs web/node_modules  ## the site of docs/, in site/
-	@echo "building the site of docs/ in site/: half a minute, or two minutes when networks have changed"
+	@echo "building the site of docs/ in site/: up to five minutes on two slow cores"
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "site/ is built; python -m http.server --directory site serves it at http://localhost:8000"
 

@@ -43,6 +43,7 @@ def on_post_page(output: str, **_: Any) -> str:
 
 def on_post_build(config: Any, **_: Any) -> None:
     """Write the page of a simulated scan into the site; MkDocs calls this last."""
+    print(f"labelling a simulated scan for {LIVE}")
     page = Path(config.site_dir) / LIVE
     with TemporaryDirectory() as folder:
         data = amvnet.simulate(Path(folder) / "street", sequences=1, scans=2, seed=SEED)

@@ -62,6 +62,7 @@ def on_files(files: Any, config: Any) -> None:
 
 def on_post_build(config: Any) -> None:
     """Add the page to the site; MkDocs calls this at the end."""
+    print("writing the page try/, which labels scans in the browser")
     out = Path(config.site_dir) / "try"
     shutil.rmtree(out)  # MkDocs has copied index.html
     if RUNTIME.is_dir():
@@ -137,6 +138,7 @@ def cached(name: str, sources: list[Path], make: Any) -> Path:
 
     folder = CACHE / f"{name}-{digest.hexdigest()[:16]}"
     if not folder.is_dir():
+        print(f"making {name} of the page try/, and keeping it in {CACHE.relative_to(ROOT)}")
         with temporary_folder(CACHE) as unfinished:
             make(unfinished)
             try:

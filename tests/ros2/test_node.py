@@ -220,6 +220,25 @@ def test_the_classes_are_published_once_for_late_subscribers(start: Callable[...
     assert [tuple(entry["color"]) for entry in classes] == list(SEMANTICKITTI.colors)
 
 
+@pytest.mark.parametrize(("sensor", "name"), [("hdl32e", "sim-hdl32e"), ("", "sim-hdl64e")])
+def test_the_first_cloud_chooses_the_weights_and_their_classes(
+    start: Callable[..., Any], sensor: str, name: str
+) -> None:
+    node = start(weights="auto", sensor=sensor)
+    assert not node.publishers["~/classes"].messages
+    assert report(node).hardware_id == ""
+
+    for seed in range(2):
+        send(node, ros_message(scan(seed)))
+    (message,) = node.publishers["~/classes"].messages
+    names = [entry["name"] for entry in json.loads(message.data)]
+    assert names == list(amvnet.weights.load(name).taxonomy.names)
+    assert report(node).hardware_id == "cpu"
+    lines = [text for _, text in node.logger.lines if text.startswith("weights ")]
+    assert len(lines) == 1
+    assert name in lines[0]
+
+
 def test_clouds_have_the_quality_of_service_of_sensor_data(start: Callable[..., Any]) -> None:
     node = start()
     _, qos = node.callbacks["points"]
@@ -259,6 +278,7 @@ def test_an_error_of_the_program_ends_the_node_with_its_traceback(
     ("parameters", "words"),
     [
         ({"weights": "nowhere"}, "nowhere"),
+        ({"weights": "auto", "method": "magic"}, "magic"),
         ({"axes": "sideways"}, "sideways"),
         ({"rotate": "1,2"}, "rotate"),
         ({"sensor": "nothing.yaml"}, "nothing.yaml"),

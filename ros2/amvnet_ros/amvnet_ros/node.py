@@ -80,14 +80,14 @@ class SegmentNode(Node):
             self._listener = TransformListener(self._frames, self)  # fills the buffer
             find_pose = self._find_pose
         self._segment = CloudSegmenter(settings, topic, self.get_logger().info, find_pose)
-        self._hardware = self._segment.hardware
         self._health = Health()
         self._report_time = time.monotonic()
 
         self._label_publisher = self._create_cloud_publisher("~/labels")
         self._cloud_publisher = self._create_cloud_publisher("~/cloud")
-        class_publisher = self.create_publisher(String, "~/classes", latched_profile())
-        class_publisher.publish(String(data=self._segment.classes()))
+        self._class_publisher = self.create_publisher(String, "~/classes", latched_profile())
+        self._has_classes = False
+        self._publish_classes()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
         self._worker = NewestOnly(self._label, self._fail)
@@ -99,7 +99,8 @@ class SegmentNode(Node):
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self.create_timer(REPORT_PERIOD, self._report)
-        self.get_logger().info(f"{settings.weights} on {self._hardware} waits for {topic}")
+        device = self._segment.hardware or settings.device
+        self.get_logger().info(f"{settings.weights} on {device} waits for {topic}")
 
     def close(self) -> None:
         """End the thread that labels."""
@@ -121,6 +122,12 @@ class SegmentNode(Node):
             PointCloud2, topic, newest_cloud_profile(), qos_overriding_options=options
         )
 
+    def _publish_classes(self) -> None:
+        """Publish the classes once, as soon as the weights are known."""
+        if not self._has_classes and self._segment.taxonomy is not None:
+            self._class_publisher.publish(String(data=self._segment.classes()))
+            self._has_classes = True
+
     def _receive(self, message: Any) -> None:
         drops = self._worker.put(_Arrival(message, time.monotonic()))
         self._health.receive(drops)
@@ -134,6 +141,7 @@ class SegmentNode(Node):
             self.get_logger().error(str(error), throttle_duration_sec=REFUSAL_PERIOD)
             return
 
+        self._publish_classes()
         # Encoding takes time, so only messages with a subscriber are encoded.
         if self._label_publisher.get_subscription_count():
             self._label_publisher.publish(to_ros(labelled, has_points=False))
@@ -195,7 +203,7 @@ class SegmentNode(Node):
             level=getattr(DiagnosticStatus, report.level.value),
             name=f"{self.get_name()}: segmentation",
             message=report.message,
-            hardware_id=self._hardware,
+            hardware_id=self._segment.hardware,
             values=values,
         )
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id="")

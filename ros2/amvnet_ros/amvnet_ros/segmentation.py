@@ -15,6 +15,7 @@ from amvnet_ros.fusion import FindPose, PastFusion
 from amvnet_ros.messages import LabelledPoints, Message
 
 if TYPE_CHECKING:  # the node sets the environment before torch reads it
+    from amvnet.data.taxonomy import Taxonomy
     from amvnet.weights.verdict import Verdict
 
 
@@ -29,7 +30,9 @@ class Settings:
     ROS has no None. A parameter is empty, 0 or negative if its value is to be measured.
     """
 
-    weights: str = _parameter("sim-hdl64e", "a name, a path, or hf-hub:OWNER/NAME")
+    weights: str = _parameter(
+        "auto", "a name, a path, or hf-hub:OWNER/NAME; auto: by the lasers of the first scan"
+    )
     method: str = _parameter("amvnet", "amvnet, rv, rv-knn, bev, ensemble, arithmetic or maximum")
     device: str = _parameter("auto", "cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU")
     engine: str = _parameter("torch", "torch, onnx or int8")
@@ -84,8 +87,8 @@ class CloudSegmenter:
     --past-only`.
 
     Attributes:
-        taxonomy: the classes.
-        hardware: the device that computes, in words.
+        taxonomy: the classes; None until the first message has chosen the weights.
+        hardware: the device that computes, in words; empty until then.
 
     Args:
         settings: the parameters of the node.
@@ -107,30 +110,42 @@ class CloudSegmenter:
         # Imported late: the node sets the environment before torch reads it.
         import torch
 
-        import amvnet
-        from amvnet.runtime.memory import keep_freed_memory
         from amvnet.sensors.lidars import make_sensor
-        from amvnet.sensors.normalise import Normaliser
 
-        sensor = make_sensor(**settings.sensor_options())
+        self._settings = settings
+        self._sensor = make_sensor(**settings.sensor_options())
+        self._topic = topic
+        self._report = report
+        self._fuse = None if find_pose is None else PastFusion(find_pose)
         if settings.threads > 0:
             torch.set_num_threads(settings.threads)
 
-        segmenter = amvnet.load(
-            settings.weights,
+        self.taxonomy: Taxonomy | None = None
+        self.hardware = ""
+        self._load(settings.weights)
+
+    def _load(self, weights: str) -> None:
+        """Load the weights of a name; for "auto", only check the parameters."""
+        import amvnet
+        from amvnet.runtime.memory import keep_freed_memory
+        from amvnet.sensors.lidars import AUTO
+        from amvnet.sensors.normalise import Normaliser
+
+        settings = self._settings
+        self._segment = amvnet.load(
+            weights,
             device=settings.device,
             method=settings.method,  # type: ignore[arg-type]  # checked there
             precision=settings.precision,  # type: ignore[arg-type]
             engine=settings.engine,  # type: ignore[arg-type]
         )
-        if segmenter.device == "cpu":
+        if weights == AUTO:
+            return
+        if self._segment.device == "cpu":
             keep_freed_memory()
-        self.taxonomy = segmenter.taxonomy
-        self.hardware = segmenter.engine.hardware
-        self._topic = topic
-        self._normalise = Normaliser(segmenter.weights.expects, sensor, report)
-        self._segment = segmenter
-        self._fuse = None if find_pose is None else PastFusion(find_pose)
+        self._normalise = Normaliser(self._segment.weights.expects, self._sensor, self._report)
+        self.taxonomy = self._segment.taxonomy
+        self.hardware = self._segment.engine.hardware
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)
 
     def __call__(self, message: Any) -> LabelledCloud:
@@ -143,6 +158,13 @@ class CloudSegmenter:
             cloud = read_message(message, self._topic)
             origin = Message.of(message)
 
+        if self.taxonomy is None:
+            from amvnet.inference.choosing import choose_by
+
+            name, reason = choose_by(cloud, self._sensor)
+            self._report(f"weights {name}, {reason}")
+            self._load(name)
+        assert self.taxonomy is not None
         scan = self._normalise(cloud, self._topic)
         result = self._segment(scan, yaw=0.0 if self._fuse is None else self._fuse.yaw(origin))
         if self._fuse is not None:  # last, because odometry often comes after its scan
@@ -159,6 +181,7 @@ class CloudSegmenter:
     def classes(self) -> str:
         """Return the classes as JSON: id (as in the field label), name and color (RGB) of each."""
         taxonomy = self.taxonomy
+        assert taxonomy is not None
         rows = zip(taxonomy.train_to_raw, taxonomy.names, taxonomy.colors, strict=True)
         entries = []
         for raw, name, color in rows:

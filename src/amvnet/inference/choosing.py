@@ -16,8 +16,15 @@ from amvnet.progress import Reporter
 from amvnet.scan import AnyArray, Scan
 from amvnet.sensors.built_in import weights_for
 from amvnet.sensors.lasers import SensorGeometry
+from amvnet.sensors.lidars import Sensor
 
 CHOSEN = ("weights", "engine", "at_once")  # what a segmenter lacks until its weights are chosen
+
+
+def choose_by(cloud: Cloud, sensor: Sensor) -> tuple[str, str]:
+    """Return the name of built-in weights for a scan in memory, and why, as `Inputs` does."""
+    scan = NamedScan("scan", source="scan", path=Path("scan"), ending="", read=lambda: cloud)
+    return Inputs([[scan]]).choose_weights(sensor)
 
 
 class ChoosingSegmenter(Segmenter):
@@ -71,8 +78,7 @@ class ChoosingSegmenter(Segmenter):
         """
         if cloud.ring is None and not self.sensor.is_known:
             return weights_for(SensorGeometry())
-        scan = NamedScan("scan", source="scan", path=Path("scan"), ending="", read=lambda: cloud)
-        return Inputs([[scan]]).choose_weights(self.sensor)
+        return choose_by(cloud, self.sensor)
 
     def _take(self, name: str, reason: str) -> None:
         """Take the weights of a name."""
