@@ -3,15 +3,17 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import repeat
 
 import numpy as np
 
 from lidarstreets.course import Course, Drive, draw_course
 from lidarstreets.layouts import SimulatedScan
 from lidarstreets.mesh import Mesh, join
+from lidarstreets.sensing.any_sensor import draw_sensor
 from lidarstreets.sensing.lidar import RayScene, trace
 from lidarstreets.sensing.returns import Lasers, draw_lasers, receive
-from lidarstreets.sensing.sensors import LidarModel, draw_device, sensor_of
+from lidarstreets.sensing.sensors import ANY, LidarModel, draw_device, sensor_of
 from lidarstreets.sites.populate import populate
 from lidarstreets.sites.site import MOVING_CLEARANCE, Site, covers
 from lidarstreets.streets.ground import Ground
@@ -33,7 +35,7 @@ def drive_street(
     """Yield the scans of one sequence, one after the other.
 
     Args:
-        sensor: the LiDAR, or its name in `LIDAR_MODELS`.
+        sensor: the LiDAR; its name in `LIDAR_MODELS`; or `ANY`, which draws one for each scan.
         scans: number of scans.
         seed: seed of all randomness.
         drive: how the sensor moves; by default like the cars of both benchmarks in towns.
@@ -41,14 +43,10 @@ def drive_street(
     Raises:
         SimulationError: if the sensor is unknown, or embreex is missing.
     """
-    if isinstance(sensor, str):
-        sensor = sensor_of(sensor)
     drive = drive or Drive()
     streets = math.ceil(scans / drive.scans_per_street)
     *street_seeds, device_seed = seed.spawn(streets + 1)
-    device_rng = np.random.default_rng(device_seed)
-    device = draw_device(sensor, device_rng)
-    lasers = draw_lasers(device, device_rng)
+    devices = _devices(sensor, np.random.default_rng(device_seed))
 
     start_pose = np.eye(4)
     start_time = 0.0
@@ -58,7 +56,7 @@ def drive_street(
     for street, street_seed in enumerate(street_seeds):
         count = min(drive.scans_per_street, scans - street * drive.scans_per_street)
         rng = np.random.default_rng(street_seed)
-        for scan in _drive_one_street(device, lasers, count, rng, drive):
+        for scan in _drive_one_street(devices, count, rng, drive):
             pose = start_pose @ scan.pose
             time = start_time + scan.time
             yield replace(scan, pose=pose, time=time)
@@ -68,11 +66,26 @@ def drive_street(
         start_time = time + 1.0
 
 
+def _devices(
+    sensor: LidarModel | str, rng: np.random.Generator
+) -> Iterator[tuple[LidarModel, Lasers]]:
+    """Yield the device of each scan and its lasers: one device, or others if any may be drawn."""
+    while True:
+        model = draw_sensor(rng) if sensor == ANY else sensor_of(sensor)
+        device = draw_device(model, rng)
+        lasers = draw_lasers(device, rng)
+        yield device, lasers
+        if sensor != ANY:
+            yield from repeat((device, lasers))
+
+
 def _drive_one_street(
-    sensor: LidarModel, lasers: Lasers, scans: int, rng: np.random.Generator, drive: Drive
+    devices: Iterator[tuple[LidarModel, Lasers]], scans: int, rng: np.random.Generator, drive: Drive
 ) -> Iterator[SimulatedScan]:
     """Yield the scans of one street; their poses are relative to the first scan."""
-    style = draw_style(rng, REGIONS[sensor.region])
+    sensor, lasers = next(devices)
+    region = sensor.region or str(rng.choice(list(REGIONS)))
+    style = draw_style(rng, REGIONS[region])
     end = drive.margin + scans * drive.spacing
     ground = Ground(style, end + drive.margin, rng, (drive.margin, end))
     speed = float(rng.uniform(*drive.speed)) * style.speed
@@ -81,6 +94,8 @@ def _drive_one_street(
 
     first_pose: np.ndarray | None = None
     for index in range(scans):
+        if index:
+            sensor, lasers = next(devices)
         time = index * drive.spacing / speed
         scenes = [fixed_scene]
         moving = _moving_mesh(site, course, index, time)

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from lidarstreets.drive import drive_street
 from lidarstreets.errors import SimulationError
 from lidarstreets.layouts import LAYOUTS, WRITE_LOCK, write_whole
 from lidarstreets.sensing.lidar import require_embree, take_one_thread
-from lidarstreets.sensing.sensors import LIDAR_MODELS, sensor_of
+from lidarstreets.sensing.sensors import LIDAR_MODELS, LidarModel, sensor_of
 
 Progress = Callable[[int, int], None]  # called with the number of scans written, and of all scans
 # Environment variables that set the number of threads of the numerical libraries.
@@ -36,7 +36,7 @@ class Sequence:
 
     Attributes:
         out: the folder of all sequences.
-        sensor: name of the sensor in `LIDAR_MODELS`.
+        sensor: the LiDAR.
         number: number of the sequence.
         scans: number of its scans.
         seed: seed of all sequences.
@@ -44,7 +44,7 @@ class Sequence:
     """
 
     out: Path
-    sensor: str
+    sensor: LidarModel
     number: int
     scans: int
     seed: int
@@ -59,7 +59,11 @@ class Sequence:
     @property
     def settings(self) -> dict[str, Any]:
         """The settings that, with the number of the sequence, determine the bytes of its files."""
-        settings = {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
+        name = self.sensor.name
+        is_known = LIDAR_MODELS.get(name) == self.sensor
+        # As JSON gives it back, with lists in the place of tuples.
+        sensor = name if is_known else json.loads(json.dumps(asdict(self.sensor)))
+        settings = {"sensor": sensor, "seed": self.seed, "scans": self.scans}
         return settings if self.spacing == SPACING else {**settings, "spacing": self.spacing}
 
     @property
@@ -76,7 +80,7 @@ class Sequence:
 def simulate(
     out: Path | str,
     *,
-    sensor: str = "hdl64e",
+    sensor: LidarModel | str = "hdl64e",
     sequences: int = 1,
     scans: int = 10,
     seed: int = 0,
@@ -92,9 +96,9 @@ def simulate(
     earlier call has completed are kept.
 
     Args:
-        out: folder to write to, in the layout of SemanticKITTI (HDL-64E), nuScenes-lidarseg
-            (HDL-32E) or a robot with a YAML file (VLP-16).
-        sensor: name of a sensor in `LIDAR_MODELS`.
+        out: folder to write to, in the layout of nuScenes-lidarseg for an HDL-32E, of a robot with
+            a YAML file for a VLP-16, and of SemanticKITTI for other sensors.
+        sensor: the LiDAR, or its name in `LIDAR_MODELS`.
         sequences: number of sequences, each in another street.
         scans: number of scans in each sequence.
         seed: seed of all randomness.
@@ -112,7 +116,8 @@ def simulate(
             folder cannot be written, or it holds a sequence that has other settings or that was
             not simulated.
     """
-    layout = LAYOUTS[sensor_of(sensor).layout]
+    model = sensor_of(sensor)
+    layout = LAYOUTS[model.layout]
     _check_at_least(1, sequences=sequences, scans=scans, processes=processes)
     _check_at_least(0, seed=seed, first_sequence=first_sequence)
     if not SHORTEST <= spacing <= LONGEST:
@@ -124,7 +129,7 @@ def simulate(
     out = Path(out)
     missing = []
     for number in range(first_sequence, first_sequence + sequences):
-        sequence = Sequence(out, sensor, number, scans, seed, spacing)
+        sequence = Sequence(out, model, number, scans, seed, spacing)
         if not _is_complete(sequence):
             _check_is_simulated(sequence)
             missing.append(sequence)
@@ -169,18 +174,31 @@ def _is_complete(sequence: Sequence) -> bool:
 
     del settings["rows"]
     if settings != sequence.settings:
+        expected, found = _differences(sequence.settings, settings)
         raise SimulationError(
-            f"{sequence.out}: expected sequence {sequence.number} with {sequence.settings}, "
-            f"found it with {settings}; choose another folder"
+            f"{sequence.out}: expected sequence {sequence.number} with {expected}, "
+            f"found it with {found}; choose another folder"
         )
     return True
 
 
+def _differences(first: Any, second: Any) -> tuple[Any, Any]:
+    """Return two settings without the entries that they share, also of a described sensor."""
+    if not (isinstance(first, dict) and isinstance(second, dict)):
+        return first, second
+    differences: tuple[dict[str, Any], dict[str, Any]] = ({}, {})
+    for key in (*first, *second):
+        if first.get(key) != second.get(key):
+            pair = _differences(first.get(key), second.get(key))
+            for found, value in zip(differences, pair, strict=True):
+                found[key] = value
+    return differences
+
+
 def _check_is_simulated(sequence: Sequence) -> None:
     """Raise if the folder of a sequence has files that were not simulated, such as real scans."""
-    place, belongs_to_all = LAYOUTS[sensor_of(sequence.sensor).layout].owned_path(
-        sequence.out, sequence.number
-    )
+    layout = LAYOUTS[sequence.sensor.layout]
+    place, belongs_to_all = layout.owned_path(sequence.out, sequence.number)
     begun = (sequence.out / MARKER_FOLDER).glob("*") if belongs_to_all else [sequence.begun]
     if os.path.lexists(place) and not any(path.exists() for path in begun):
         raise SimulationError(
@@ -254,11 +272,11 @@ def _write_all(sequence: Sequence) -> int:
 
 def _write(sequence: Sequence) -> Iterator[int]:
     """Write one sequence; yield 1 after each scan."""
-    model = LIDAR_MODELS[sequence.sensor]
-    layout = LAYOUTS[model.layout](sequence.out, sequence.number)
+    layout = LAYOUTS[sequence.sensor.layout](sequence.out, sequence.number)
     seed = np.random.SeedSequence((sequence.seed, sequence.number))
     write_whole(sequence.begun, b"")
-    for index, scan in enumerate(drive_street(model, sequence.scans, seed, sequence.drive)):
+    scans = drive_street(sequence.sensor, sequence.scans, seed, sequence.drive)
+    for index, scan in enumerate(scans):
         layout.write_scan(index, scan)
         yield 1
 

@@ -20,19 +20,20 @@ from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.datasets.select import to_train
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.datasets.training_data import Source, TrainingData
-from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.laser_order import lasers_by_order
+from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, drive_street, simulate, writing
 
 from fixtures.commands import fails
 from fixtures.tiny import fake_drive
 
-BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
+BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES, "vlp32c": SEMANTICKITTI}
 
 
-@pytest.fixture(params=CLASSES_BY_SENSOR)
+@pytest.fixture(params=BENCHMARKS)
 def sensor(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name
@@ -76,7 +77,9 @@ def test_a_scan_equals_that_of_the_files_of_a_simulation(
             if not is_real:
                 continue
             # The order of the points in the files of SemanticKITTI tells their rings.
-            other = replace(other, ring=lasers_by_order(other.points, 64))
+            lasers = KNOWN_SENSORS[sensor].beams
+            assert lasers is not None
+            other = replace(other, ring=lasers_by_order(other.points, lasers))
         assert scan.ring is not None
         assert other.ring is not None
         assert np.array_equal(scan.ring, other.ring)
@@ -105,7 +108,7 @@ def test_the_splits_are_different_streets(sensor: str, tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path, sensor)
     train = dataset.sequences("train")
     assert train[:2] == ("000000", "000001")
-    assert len(train) == {"hdl64e": 140, "hdl32e": 84}[sensor]
+    assert len(train) == {"hdl64e": 140, "hdl32e": 84, "vlp32c": 1000}[sensor]
     assert dataset.sequences("val") == tuple(f"90000{index}" for index in range(6))
     assert dataset.sequences("all") == (*train, *dataset.sequences("val"))
     fails(lambda: dataset.sequences("test"), "train, val, all", "test")

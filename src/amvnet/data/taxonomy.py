@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from amvnet.config.bounds import check_text
 from amvnet.errors import InputError, listed, one_line_errors, shown
+from lidarstreets import ANY, LIDAR_MODELS
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
@@ -321,5 +322,5 @@ def _built_in() -> dict[str, Taxonomy]:
 TAXONOMIES: Mapping[str, Taxonomy] = _built_in()
 SEMANTICKITTI = TAXONOMIES["semantickitti"]
 NUSCENES = TAXONOMIES["nuscenes"]
-# The classes in the files that the simulator writes for each sensor.
-CLASSES_BY_SENSOR = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
+# The classes of the streets that are simulated for each sensor.
+CLASSES_BY_SENSOR = dict.fromkeys((*LIDAR_MODELS, ANY), SEMANTICKITTI) | {"hdl32e": NUSCENES}

@@ -22,7 +22,7 @@ from amvnet.sensors.intensity import (
 )
 from amvnet.sensors.laser_order import lasers_by_order, order_rings
 from amvnet.sensors.lasers import MEASURES, SensorGeometry
-from amvnet.sensors.lidars import KNOWN_HEIGHTS, KNOWN_SENSORS, Sensor
+from amvnet.sensors.lidars import ANY, KNOWN_HEIGHTS, KNOWN_SENSORS, Sensor
 
 
 @dataclass(frozen=True)
@@ -121,9 +121,10 @@ class Expectation:
 def trained_sensor(name: str, measured: SensorGeometry) -> Sensor:
     """Return the sensor of a training: what was measured of it, else what its data sheet says.
 
-    It has the name of the data sheet only if the number of its lasers is that of the sheet.
+    It has the name of the data sheet only if the number of its lasers is that of the sheet, or the
+    name `ANY` if the training has shown sensors of all kinds.
     """
-    sheet = KNOWN_SENSORS.get(name, Sensor())
+    sheet = Sensor(name=name) if name == ANY else KNOWN_SENSORS.get(name, Sensor())
     height = KNOWN_HEIGHTS.get(name)
     sensor = dataclasses.replace(sheet, height=height)
 
@@ -132,4 +133,6 @@ def trained_sensor(name: str, measured: SensorGeometry) -> Sensor:
         measures.setdefault("beams", None)  # it is not the sensor of the data sheet
     with suppress(InputError):  # of scans that show no possible sensor
         sensor = dataclasses.replace(sensor, **measures)
-    return sensor if sensor.beams == sheet.beams else dataclasses.replace(sensor, name="")
+    if name == ANY or sensor.beams == sheet.beams:
+        return sensor
+    return dataclasses.replace(sensor, name="")

@@ -86,6 +86,11 @@ class TrainedIntensity:
         return np.interp(draws, PROBABILITIES, self.quantiles).astype(np.float32)
 
 
+def simulated_quantiles(sensor: str) -> tuple[float, ...]:
+    """Return the quantiles of a simulated sensor; those of an HDL-64E if it has none of its own."""
+    return SIMULATED_QUANTILES.get(sensor, SIMULATED_QUANTILES["hdl64e"])
+
+
 def match_scan(scan: Scan, trained: Sequence[float]) -> Scan:
     """Return a scan whose intensities have the quantiles of a training; constant ones stay."""
     valid = scan.valid

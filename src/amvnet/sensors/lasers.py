@@ -20,6 +20,11 @@ FOV_PERCENTILES = (0.5, 99.5)  # percentiles of the elevations at the ends of th
 SAME_ANGLE = 6.0  # largest difference of an end of the field of view of like sensors, degrees
 SAME_BEAMS = 1.4  # limit of the ratio between the numbers of lasers of like sensors
 
+# Edges of the bins of elevation in which lasers are counted, degrees.
+ELEVATION_EDGES = np.linspace(-90, 90, 361)
+SECTORS = 180  # number of sectors of azimuth in which the points of a bin are counted
+SMOOTHED_BINS = 7  # number of neighbouring bins of elevation that are counted together; odd
+
 MEASURES = ("beams", "fov_up", "fov_down", "height")  # the attributes of a SensorGeometry
 
 
@@ -116,6 +121,50 @@ def measure_lasers(points: np.ndarray, ring: np.ndarray | None = None) -> Sensor
     down, up = np.percentile(elevations(xyz[is_distant]), FOV_PERCENTILES)
     beams = None if ring is None else len(np.unique(ring))
     return SensorGeometry(beams, float(up), float(down))
+
+
+def laser_density(points: np.ndarray) -> NDArray[np.float64]:
+    """Return how close together the lasers of a scan are, in bins between `ELEVATION_EDGES`.
+
+    This is the mean number of points around a bin in the sectors that have any there: (360,). Where
+    lasers see the sky, sectors are empty and do not count, so that lost returns change little. The
+    unit is unknown, and the density is 0 outside the field of view. No rings are needed.
+
+    Args:
+        points: (N, 3 or more) points as `measure` takes them.
+    """
+    xyz = points[:, :3].astype(np.float64)
+    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > MIN_DISTANCE]
+    bins = len(ELEVATION_EDGES) - 1
+    if len(xyz) < MIN_POINTS:
+        return np.zeros(bins)
+
+    elevation = elevations(xyz)
+    sector = (np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) + 0.5) * SECTORS
+    cell = np.digitize(elevation, ELEVATION_EDGES[1:-1]) * SECTORS
+    cell += np.minimum(sector.astype(np.int64), SECTORS - 1)
+    counts = np.bincount(cell, minlength=bins * SECTORS).reshape(bins, SECTORS)
+    padded = np.pad(counts, ((SMOOTHED_BINS // 2,) * 2, (0, 0)))
+    around = np.lib.stride_tricks.sliding_window_view(padded, SMOOTHED_BINS, axis=0).sum(axis=-1)
+    density = around.sum(axis=1) / np.maximum(np.count_nonzero(around, axis=1), 1)
+
+    down, up = np.percentile(elevation, FOV_PERCENTILES)
+    inside = (ELEVATION_EDGES[1:] > down) & (ELEVATION_EDGES[:-1] < up)
+    within: NDArray[np.float64] = np.where(inside, density, 0.0)
+    return within
+
+
+def rows_by_density(
+    points: np.ndarray, density: NDArray[np.float64], rows: int
+) -> NDArray[np.int64]:
+    """Return the row of each point (N,), so that each row has about equally many lasers.
+
+    Rows are counted from the top. Points outside the field of view get the first or the last row.
+    """
+    below = np.concatenate([[0.0], np.cumsum(density)])
+    share = np.interp(elevations(points[:, :3].astype(np.float64)), ELEVATION_EDGES, below)
+    row: NDArray[np.int64] = ((1 - share / below[-1]) * rows).astype(np.int64)
+    return np.clip(row, 0, rows - 1)
 
 
 def measure_sensor(scans: Iterable[Scan]) -> SensorGeometry:

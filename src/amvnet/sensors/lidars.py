@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
+from lidarstreets import ANY as ANY
+from lidarstreets import LIDAR_MODELS, LidarModel, evenly_spaced
 
 # Heights of the sensors over the ground on the cars that recorded KITTI and nuScenes, metres.
-KNOWN_HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
+# Scans of any sensor are moved to the height of KITTI's.
+KNOWN_HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84, ANY: 1.73}
 
 # The cars' own bodies in the frame of their scans: the lowest and the highest x, y, z, metres.
 # KITTI's scans hardly have a point of its car.
@@ -43,9 +44,11 @@ Box = tuple[float, float, float, float, float, float]
 MAKER_PREFIXES = {
     "velodyne": ("hdl", "vlp", "vls"),
     "ouster": ("os",),
-    "hesai": ("pandar", "xt"),
-    "robosense": ("rs",),
+    "hesai": ("pandar", "ot", "qt", "xt"),
+    "robosense": ("rs", "ruby", "helios"),
 }
+MAX_LASERS = 256  # largest number of lasers that are simulated
+USUAL_SHOTS = 1800  # number of shots of a laser in a rotation, if nothing says otherwise
 MAX_NUMBER = 1e9  # largest number in the description of a sensor
 
 
@@ -177,8 +180,40 @@ def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> NDArray[np.f
     return rotation
 
 
-_SHEETS = tomllib.loads((files("amvnet.sensors") / "lidars.toml").read_text(encoding="utf-8"))
-KNOWN_SENSORS = {name: Sensor(name, *sheet) for name, sheet in _SHEETS.items()}
+# The data sheets do not say how a sensor is mounted on a vehicle.
+KNOWN_SENSORS = {
+    name: Sensor(name, len(model.elevations), *model.ends) for name, model in LIDAR_MODELS.items()
+}
+
+
+def simulated_lidar(sensor: Sensor) -> LidarModel:
+    """Return the LiDAR that simulates a sensor.
+
+    A known sensor has the lasers of its data sheet. The lasers of others are evenly spaced. What
+    `Sensor` does not say is as usual.
+
+    Raises:
+        InputError: if the number of lasers, an end of the field of view or the height is unknown,
+            or there are more than `MAX_LASERS` lasers.
+    """
+    known = LIDAR_MODELS.get(sensor.name)
+    if known is not None and dataclasses.replace(sensor, height=None) == KNOWN_SENSORS[known.name]:
+        return known if sensor.height is None else known.at_height(sensor.height)
+
+    beams, top, bottom, height = sensor.beams, sensor.fov_up, sensor.fov_down, sensor.height
+    if beams is None or top is None or bottom is None or height is None:
+        numbers = {"beams": beams, "fov_up": top, "fov_down": bottom, "height": height}
+        missing = [key for key, value in numbers.items() if value is None]
+        raise InputError(
+            f"{sensor.name or 'sensor'}: expected {', '.join(numbers)} to simulate the sensor, "
+            f"found no {' and no '.join(missing)}; state {' and '.join(missing)}"
+        )
+    if beams > MAX_LASERS:
+        raise InputError(
+            f"{sensor.name}: expected at most {MAX_LASERS} beams to simulate, found {beams}; "
+            "correct the number"
+        )
+    return LidarModel(evenly_spaced(beams, top, bottom), USUAL_SHOTS, height, sensor.name)
 
 
 def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -> Sensor:

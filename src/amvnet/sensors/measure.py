@@ -15,7 +15,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.frame import QUICK_STEP, STEADY_TILT, Frame, find_frame, median_frame
 from amvnet.sensors.intensity import are_of_one_range, quantiles_of
 from amvnet.sensors.laser_order import order_rings
-from amvnet.sensors.lasers import SensorGeometry, measure_lasers
+from amvnet.sensors.lasers import SensorGeometry, laser_density, measure_lasers
 from amvnet.sensors.lidars import Sensor
 
 MEASURED_SCANS = 5  # number of measured scans in a recording; later scans get their median
@@ -30,12 +30,14 @@ class Estimate:
     Attributes:
         quantiles: the quantiles of the intensities in the files at `PROBABILITIES`, or None if the
             files have no intensities.
+        density: how close together the lasers are (`laser_density`); None if it is unknown.
         is_steady: whether the scans were recorded in one frame, at one height.
     """
 
     frame: Frame
     lasers: SensorGeometry
     quantiles: np.ndarray | None
+    density: np.ndarray | None = None
     is_steady: bool = True
 
     def is_like(self, other: Estimate) -> bool:
@@ -141,8 +143,10 @@ class Recording:
         """Measure the lasers and the intensities of a scan whose frame is known."""
         seen, _ = seen_scan(cloud, frame, self._sensor, self._usual_height)
         valid = seen.valid
-        lasers = measure_lasers(seen.points[valid], None if seen.ring is None else seen.ring[valid])
-        return Estimate(frame, lasers, quantiles_of(cloud.measured_intensity()))
+        points = seen.points[valid]
+        lasers = measure_lasers(points, None if seen.ring is None else seen.ring[valid])
+        density = laser_density(points)
+        return Estimate(frame, lasers, quantiles_of(cloud.measured_intensity()), density)
 
     def _recognises(self, cloud: Cloud, usual: Estimate) -> bool:
         """Return whether a scan in the usual frame is from the usual sensor.
@@ -172,11 +176,13 @@ def median_of(estimates: Sequence[Estimate]) -> Estimate:
     """Return the estimate whose values are the medians of the known values of some estimates."""
     frames = [estimate.frame for estimate in estimates]
     quantiles = [each.quantiles for each in estimates if each.quantiles is not None]
+    densities = [each.density for each in estimates if each.density is not None]
 
     return Estimate(
         median_frame(frames),
         SensorGeometry.median([estimate.lasers for estimate in estimates]),
         quantiles=np.median(quantiles, axis=0) if quantiles else None,
+        density=np.mean(densities, axis=0) if densities else None,
         is_steady=_are_steady(frames),
     )
 

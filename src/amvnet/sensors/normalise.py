@@ -20,8 +20,8 @@ from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.frame import MAX_SENSOR_HEIGHT, Frame
 from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
 from amvnet.sensors.laser_order import lasers_by_order
-from amvnet.sensors.lasers import SensorGeometry, describe_lasers, elevations
-from amvnet.sensors.lidars import UNITS, Sensor, make_sensor, rotation_from_degrees
+from amvnet.sensors.lasers import SensorGeometry, describe_lasers, elevations, rows_by_density
+from amvnet.sensors.lidars import ANY, UNITS, Sensor, make_sensor, rotation_from_degrees
 from amvnet.sensors.measure import (
     MEASURED_SCANS,
     Estimate,
@@ -61,6 +61,8 @@ def normalise(
 
     lasers = estimate.lasers.override(sensor)
     row = _rows_by_laser(seen, complete, lasers, expected)
+    if row is None and expected.sensor.name == ANY:
+        row = _rows_by_density(seen, estimate.density, expected)
     if row is None:
         row = _rows(seen, lasers, expected)
     own = own_points(cloud.xyz * UNITS[estimate.frame.unit], cloud.ring, sensor)
@@ -86,7 +88,7 @@ def describe(
     line = f"{cloud.name}: assumed {', '.join(filter(None, assumed))}"
 
     trained = expected.sensor
-    is_named = bool(sensor.name) and sensor.name == trained.name
+    is_named = trained.name == ANY or (bool(sensor.name) and sensor.name == trained.name)
     if expected.lasers.field_of_view is None or is_named or lasers.is_like(expected.lasers):
         return line
 
@@ -360,6 +362,21 @@ def _rows(scan: Scan, lasers: SensorGeometry, expected: Expectation) -> np.ndarr
     rows[valid] = RangeView(view).rows(PointBatch.of([scan])).numpy()
     if by_ring is not None and np.median(np.abs(by_ring - rows)[valid]) < 1:
         return by_ring
+    return rows
+
+
+def _rows_by_density(
+    seen: Scan, density: np.ndarray | None, expected: Expectation
+) -> np.ndarray | None:
+    """Return the row of each point so that all rows have about equally many lasers, -1 is lost.
+
+    Return None if the density of the lasers is unknown.
+    """
+    if density is None or not density.any():
+        return None
+    rows = np.full(len(seen), -1)
+    valid = seen.valid
+    rows[valid] = rows_by_density(seen.points[valid], density, expected.view.height)
     return rows
 
 

@@ -14,12 +14,13 @@ from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation, trained_sensor
 from amvnet.sensors.intensity import (
     NO_INTENSITY,
-    SIMULATED_QUANTILES,
     TrainedIntensity,
     are_quantiles,
     mean_quantiles,
+    simulated_quantiles,
 )
 from amvnet.sensors.lasers import measure_sensor
+from amvnet.sensors.lidars import ANY
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
 
@@ -44,7 +45,12 @@ def expected_before(
     intensity = known.intensity
     if intensity is not None and hides and not stay:
         intensity = dataclasses.replace(intensity, is_optional=True)
-    return dataclasses.replace(known, view=recipe.model.range_view, intensity=intensity)
+    sensor = known.sensor
+    if recipe.sensor == ANY:
+        sensor = dataclasses.replace(sensor, name=ANY)
+    return dataclasses.replace(
+        known, view=recipe.model.range_view, sensor=sensor, intensity=intensity
+    )
 
 
 def expected_after(
@@ -68,7 +74,7 @@ def expected_after(
     intensity = known.intensity
     is_optional = intensity is not None and intensity.is_optional
     if first.simulated_sensor:
-        simulated = SIMULATED_QUANTILES[first.simulated_sensor]
+        simulated = simulated_quantiles(first.simulated_sensor)
         intensity = TrainedIntensity(simulated, is_optional, is_matched=True)
     elif intensity is None or (as_is and not intensity.is_matched):
         quantiles = mean_quantiles(sampled)
@@ -86,9 +92,9 @@ def _networks(stages: Sequence[str]) -> set[str]:
 
 
 def _sample(data: TrainingData) -> list[Scan]:
-    """Read some of the scans to train on, but no broken ones, which the training reports."""
+    """Read some of the first source's scans, but no broken ones, which the training reports."""
     sample = []
-    for index in evenly_spaced(range(len(data)), SAMPLED_SCANS):
+    for index in evenly_spaced(range(data.places[0]), SAMPLED_SCANS):
         with suppress(InputError):
             sample.append(data.read(index, labels=False))
     return sample

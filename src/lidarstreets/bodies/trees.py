@@ -192,6 +192,21 @@ def random_tree(rng: np.random.Generator, height: float, fine: bool = True) -> M
     return tree(rng, height, fine)
 
 
+def palm(rng: np.random.Generator, height: float) -> Mesh:
+    """Return a palm: a bare stem, with a crown of leaves at its top."""
+    stem, fork = _stem(rng, height * 0.9, rng.uniform(0.12, 0.25), slant=0.04)
+    wide = rng.uniform(0.9, 2.2)
+    crown = hull(rng, fork, (wide, wide, wide * rng.uniform(0.4, 0.8)), fine=False)
+    return join(part(stem, Surface.BARK, Label.TRUNK), foliage([crown], rng.uniform(0.2, 1.2)))
+
+
+def street_tree(rng: np.random.Generator, height: float, palms: float) -> Mesh:
+    """Return a tree of a street or a garden, in a region with a share `palms` of palms."""
+    if palms and rng.random() < palms:
+        return palm(rng, height * rng.uniform(0.8, 1.8))
+    return random_tree(rng, height)
+
+
 def copse(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """Return the edge of a distant wood, `length` metres along x."""
     size = (rng.uniform(4, 9), height * rng.uniform(0.8, 1.2))

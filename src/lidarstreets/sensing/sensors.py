@@ -1,13 +1,16 @@
 """Define the LiDARs that can be simulated; sensors.toml has the numbers of each."""
 
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lidarstreets.errors import SimulationError
 from lidarstreets.tables import read_table
 
+ANY = "any"  # stands for a sensor that is drawn for each scan
 # Largest difference between the numbers of a device and of its type, in standard deviations.
 MAX_DEVIATIONS = 2.5
 
@@ -22,42 +25,46 @@ class LidarModel:
     azimuth_steps: int
     # Height above the ground in metres.
     height: float
+    # Name of the type, a key of `LIDAR_MODELS`, or of the description that it is from.
+    name: str = ""
+    # Ends of the field of view by the data sheet, degrees; by default the outermost lasers.
+    fov: tuple[float, float] | None = None
     # Smallest and largest range that the device measures, in metres.
-    min_range: float
-    max_range: float
+    min_range: float = 0.5
+    max_range: float = 100.0
     # Standard deviation of the range in metres.
-    range_noise: float
+    range_noise: float = 0.01
     # Each laser has a constant error of its range: standard deviation between lasers, in metres.
-    range_error: float
+    range_error: float = 0.01
     # Range in metres at which half of the returns are lost, for a white surface hit head-on.
-    reach: float
+    reach: float = 230.0
     # Share of the returns at a depth edge that lie between the two surfaces, 0 to 1.
-    mixed: float
+    mixed: float = 0.045
     # A near surface hit head-on has the intensity `gain * reflectivity ** gamma`, rounded to
     # `decimals` decimals.
-    gain: float
-    gamma: float
-    decimals: int
+    gain: float = 1.0
+    gamma: float = 1.0
+    decimals: int = 2
     # Spread of the gains between lasers: scale of a Student's t distribution with three degrees
     # of freedom.
-    gain_spread: float
+    gain_spread: float = 0.1
     # Power at which the device reports half of the reflectivity. A white surface hit head-on at
     # 10 m returns the power 1.
-    half_power: float
+    half_power: float = 0.002
     # Seconds per rotation; the sensor looks ahead in the middle of it.
-    rotation_period: float
+    rotation_period: float = 0.1
     # Whether the rotation is counter-clockwise seen from above.
-    counter_clockwise: bool
+    counter_clockwise: bool = False
     # Whether a lost return is written as a point within a metre of the sensor.
-    keeps_lost_returns: bool
+    keeps_lost_returns: bool = False
     # Layout of the files, a key of `LAYOUTS`.
-    layout: str
+    layout: str = "semantickitti"
     # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
-    shadow: tuple[tuple[float, float, float, float], ...]
+    shadow: tuple[tuple[float, float, float, float], ...] = ()
     # Unit of the azimuth that the device counts in, degrees; 0 if it is too small to matter.
     azimuth_unit: float = 0.0
-    # Where the sensor drives, a key of `REGIONS`.
-    region: str = "karlsruhe"
+    # Where the sensor drives, a key of `REGIONS`; "" draws the region of each street.
+    region: str = ""
     # Share of the returns that are lost, whatever they hit, 0 to 1.
     drop: float = 0.01
     # Pairs of a rising elevation in degrees and a height in metres: lasers of this elevation look
@@ -100,17 +107,41 @@ class LidarModel:
     # `gain_spread`. For `gain`, which makers calibrate, it is multiplied by 0.08.
     response_spread: float = 0.35
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The upper and the lower end of the field of view by the data sheet, degrees."""
+        return self.fov or (self.elevations[0], self.elevations[-1])
+
+    def at_height(self, height: float) -> "LidarModel":
+        """Return the same LiDAR at a height over the ground in metres, the same on each drive."""
+        return replace(self, height=height, height_spread=0.0)
+
+
+def evenly_spaced(lasers: int, top: float, bottom: float) -> tuple[float, ...]:
+    """Return the elevations of lasers that are evenly spaced between two ends, degrees."""
+    return tuple(np.linspace(top, bottom, lasers).round(6).tolist())
+
+
+def _model(name: str, row: dict[str, Any]) -> LidarModel:
+    """Return a LiDAR of the table; `lasers` are runs of evenly spaced lasers."""
+    runs = row.pop("lasers", ())
+    if runs:
+        row["elevations"] = tuple(chain.from_iterable(evenly_spaced(*run) for run in runs))
+    return LidarModel(name=name, **row)
+
 
 _TABLE = read_table(Path(__file__).with_suffix(".toml"))
-LIDAR_MODELS = {name: LidarModel(**row) for name, row in _TABLE.items()}
+LIDAR_MODELS = {name: _model(name, row) for name, row in _TABLE.items()}
 
 
-def sensor_of(name: str) -> LidarModel:
-    """Return the LiDAR with a name.
+def sensor_of(name: LidarModel | str) -> LidarModel:
+    """Return the LiDAR with a name, or the LiDAR that is given instead of a name.
 
     Raises:
         SimulationError: if `LIDAR_MODELS` has no such name.
     """
+    if isinstance(name, LidarModel):
+        return name
     if name not in LIDAR_MODELS:
         names = ", ".join(LIDAR_MODELS)
         raise SimulationError(

@@ -49,7 +49,7 @@ def _plant_garden(plot: Plot, setback: float) -> None:
 
     for _ in range(rng.poisson(0.6 * green)):
         distance = plot.front + rng.uniform(0.6, setback + 1)
-        tree = trees.random_tree(rng, rng.uniform(3, 9))
+        tree = trees.street_tree(rng, rng.uniform(3, 9), plot.style.region.palms)
         plot.put(tree, plot.random_x(), distance)
 
     if rng.random() < 0.25 * green:

@@ -34,14 +34,14 @@ def fill_roadside(site: Site, side: int) -> None:
     back_t = side * (max(ground.front(side), ground.kerb_t(side) + 0.5) - 0.3)
     yaw = along_road(side)
 
-    has_wires = style.kind == "rural" or rng.random() < 0.15
+    has_wires = style.kind == "rural" or rng.random() < 0.15 * style.region.wires
     make_pole = furniture.utility_pole if has_wires else furniture.lamp
     for x in np.arange(rng.uniform(0, style.lamps), ground.length, style.lamps):
         _put_on_street(site, make_pole(rng), x, kerb_t if rng.random() < 0.7 else back_t, yaw)
 
     if np.isfinite(style.trees):
         for x in np.arange(rng.uniform(0, style.trees), ground.length, style.trees):
-            tree = trees.random_tree(rng, rng.uniform(4, 9))
+            tree = trees.street_tree(rng, rng.uniform(4, 9), style.region.palms)
             site.put(tree, x + rng.normal(), back_t, margin=2.0)
     has_parking = style.parking[int(side > 0)] > 0 and not style.is_bus_bay[int(side > 0)]
     if np.isfinite(style.parking_period) and has_parking and rng.random() < 0.6:
@@ -91,7 +91,7 @@ def _plant_parking_islands(site: Site, side: int) -> None:
     style = site.ground.style
     t = side * (style.road / 2 + style.parking[int(side > 0)] * 0.6)
     for x in np.arange(1.0, site.ground.length, style.parking_period):
-        tree = trees.random_tree(site.rng, site.rng.uniform(3, 8))
+        tree = trees.street_tree(site.rng, site.rng.uniform(3, 8), site.ground.style.region.palms)
         site.put(tree, x, t, margin=2.0)
 
 
@@ -117,7 +117,8 @@ def fill_islands(site: Site) -> None:
 
         for x in np.arange(start + 3, stop - 3, rng.uniform(7, 16)):
             if has_trees and style.median > 1.5:
-                site.put(trees.random_tree(rng, rng.uniform(4, 9)), x, middle)
+                palms = site.ground.style.region.palms
+                site.put(trees.street_tree(rng, rng.uniform(4, 9), palms), x, middle)
             elif rng.random() < 0.3:
                 site.put(furniture.lamp(rng), x, middle)
             elif rng.random() < 0.4:

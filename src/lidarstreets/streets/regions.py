@@ -23,6 +23,18 @@ class Region:
     work_zones: float = 1.0
     # Factor on the heights of houses.
     storeys: float = 1.0
+    # Factor on the widths of lanes.
+    lanes: float = 1.0
+    # Factor on the chance of a parking lane.
+    parking: float = 1.0
+    # Factor on the slopes of streets.
+    slopes: float = 1.0
+    # Factor on the distances of houses from the front of their plots.
+    setback: float = 1.0
+    # Factor on the chance that utility poles stand along a street instead of lamps.
+    wires: float = 1.0
+    # Share of the trees along streets and in gardens that are palms.
+    palms: float = 0.0
 
 
 _TABLE = read_table(Path(__file__).with_suffix(".toml"))

@@ -15,6 +15,7 @@ class Relief:
     def __init__(self, style: Style, rng: np.random.Generator) -> None:
         self._banks = style.bank
         slopes = rng.normal(scale=0.03, size=2) if rng.random() < 0.6 else np.zeros(2)
+        slopes = slopes * style.region.slopes
         self._slope = np.clip(slopes * np.array([1.0, 0.4]), -STEEPEST, STEEPEST)
 
         # The hills are three waves, from long to short.

@@ -107,8 +107,8 @@ def draw_style(rng: np.random.Generator, region: Region) -> Style:
     has_long_median = bool(middle < kind.median)
     has_islands = bool(kind.median <= middle < kind.median + kind.islands)
     median = _draw_median(rng, has_long_median, has_islands)
-    lanes, road = _draw_lanes(rng, kind, median)
-    parking, angles, is_bus_bay = _draw_parking(rng, kind)
+    lanes, road = _draw_lanes(rng, kind, median, region.lanes)
+    parking, angles, is_bus_bay = _draw_parking(rng, kind, kind.parking * region.parking)
     is_flush = name == "living" or rng.random() < 0.06
 
     return Style(
@@ -127,7 +127,7 @@ def draw_style(rng: np.random.Generator, region: Region) -> Style:
         kerb=float(rng.uniform(0.0, 0.03) if is_flush else rng.uniform(0.03, 0.18)),
         bank=(_draw_bank(rng, kind.relief), _draw_bank(rng, kind.relief)),
         plots=(house, row, wood, field, lot),
-        setback=kind.setback,
+        setback=(kind.setback[0] * region.setback, kind.setback[1] * region.setback),
         storeys=(lowest * region.storeys, highest * region.storeys),
         parked=kind.parked * rng.uniform(0.3, 1.5),
         trees=kind.trees * rng.uniform(0.6, 2.0) if rng.random() < 0.6 else np.inf,
@@ -160,10 +160,13 @@ def _draw_median_label(rng: np.random.Generator, is_long: bool) -> Label:
 
 
 def _draw_lanes(
-    rng: np.random.Generator, kind: Kind, median: float
+    rng: np.random.Generator, kind: Kind, median: float, factor: float
 ) -> tuple[tuple[tuple[float, int], ...], float]:
-    """Draw the lanes of a street as in `Style`, and the width of the carriageway in metres."""
-    width = rng.uniform(*kind.lane)
+    """Draw the lanes of a street as in `Style`, and the width of the carriageway in metres.
+
+    The width of a lane is `factor` times the width that is usual for the kind of street.
+    """
+    width = rng.uniform(*kind.lane) * factor
     count = 1 + int(rng.choice(3, p=kind.lanes))
     margin = rng.uniform(0.0, 0.6)
     half = median / 2 + count * width + margin
@@ -179,9 +182,12 @@ def _draw_lanes(
 
 
 def _draw_parking(
-    rng: np.random.Generator, kind: Kind
+    rng: np.random.Generator, kind: Kind, chance: float
 ) -> tuple[tuple[float, float], tuple[float, float], tuple[bool, bool]]:
-    """Draw `parking`, `parking_angle` and `is_bus_bay` of a `Style`."""
+    """Draw `parking`, `parking_angle` and `is_bus_bay` of a `Style`.
+
+    `chance` is the chance of a parking lane on each side.
+    """
     widths = []
     angles = []
     bays = []
@@ -191,7 +197,7 @@ def _draw_parking(
         if rng.random() < 0.2:
             angle = np.pi / 2 if rng.random() < 0.6 else rng.uniform(0.6, 1.2)
             width = rng.uniform(4.2, 5.4)
-        has_parking = rng.random() < kind.parking
+        has_parking = rng.random() < chance
         is_bay = not has_parking and rng.random() < kind.bus_bays
         if is_bay:
             width = rng.uniform(2.6, 3.8)

@@ -15,6 +15,7 @@ def simulate(
     out: Path,
     /,
     sensor: str = "hdl64e",
+    height: float | None = None,
     sequences: Count = 1,
     scans: Count = 10,
     seed: Seed = 0,
@@ -25,9 +26,10 @@ def simulate(
 
     Args:
         out: folder to write to.
-        sensor: the LiDAR: hdl64e (in the layout of SemanticKITTI), hdl32e (in the layout of
-            nuScenes-lidarseg), or vlp16 (on a robot; robot.yaml in the folder describes the
-            layout).
+        sensor: the LiDAR: a name that amvnet list prints, or a YAML file that states its beams,
+            fov_up, fov_down and height. The files have the layout of SemanticKITTI; for hdl32e, of
+            nuScenes-lidarseg; for vlp16, of a robot, which robot.yaml in the folder describes.
+        height: the height of the sensor above the ground, metres; default: a usual one.
         sequences: number of sequences; each is another street.
         scans: number of scans in each sequence.
         seed: the seed of all random numbers; the same seed gives the same bytes on the same kind of
@@ -39,12 +41,14 @@ def simulate(
     """
     from amvnet.data.datasets.simulated import simulate as simulate_streets
     from amvnet.files import check_no_links
+    from amvnet.sensors.lidars import make_sensor, simulated_lidar
 
+    lidar = simulated_lidar(make_sensor(sensor, height=height))
     check_no_links(out)  # because the simulator does not look
     with progress("simulating") as step:
         simulate_streets(
             out,
-            sensor=sensor,
+            sensor=lidar,
             sequences=sequences,
             scans=scans,
             seed=seed,
@@ -52,4 +56,6 @@ def simulate(
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=step,
         )
-    report(f"{counted(sequences * scans, 'scan')} in {out}")
+    lasers = f"{counted(len(lidar.elevations), 'laser')} from {lidar.ends[0]:+.0f} to "
+    lasers += f"{lidar.ends[1]:+.0f} degrees, {lidar.height:g} m over the ground"
+    report(f"{counted(sequences * scans, 'scan')} in {out}: {lasers}")

@@ -34,10 +34,10 @@ def train(
         recipe: the name of a built-in recipe, or a YAML file.
         data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts;
             a YAML file that describes scans and classes of your own (docs/own_data.md);
-            simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
-            the training and cached in the folder. If several are given, the first one is
-            split and validated, and the training scans of the others are mixed in: all of them, or
-            as many as --training.others says.
+            simulated-NAME:FOLDER, with a known sensor or any, for streets that are simulated during
+            the training and cached in the folder. If several are given, the first one is split and
+            validated, and the training scans of the others are mixed in: all of them, or as many as
+            --training.others says.
         out: folder of the run.
         choice: which scans to train on and to validate with.
         models: with --stage head, the scores of two other models to train a head on.

@@ -27,9 +27,9 @@ def open_dataset(spec: str, classes: Taxonomy | None = None) -> Dataset:
 
     Args:
         spec: `semantickitti:PATH`, `nuscenes:PATH`, `nuscenes:PATH@v1.0-mini`, or a plain path with
-            the layout of one of them; or `simulated-hdl64e:PATH` or `simulated-hdl32e:PATH`, for
-            streets that are simulated when they are read and cached in a folder; or `files:FILE`,
-            or only FILE, the YAML file that describes a user's own scans and classes.
+            the layout of one of them; or `simulated-NAME:PATH`, with a name in `CLASSES_BY_SENSOR`,
+            for streets that are simulated when they are read and cached in a folder; or
+            `files:FILE`, or only FILE, the YAML file that describes a user's own scans and classes.
         classes: the classes that the dataset must have, for example the classes of weights. A
             user's own scans can be opened with any classes; labels of other classes are not read.
 

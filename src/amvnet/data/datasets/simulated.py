@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import inspect
 import os
@@ -16,7 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, Normalise, ScanRecord
+from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.labels.ids import write_array
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI
@@ -27,7 +29,10 @@ from lidarstreets import SimulationError, drive_street
 from lidarstreets import simulate as simulate_streets
 
 SCANS = 6  # number of scans of a street
-TRAIN_STREETS = {"hdl64e": 140, "hdl32e": 84}
+TRAIN_STREETS = {"hdl64e": 140, "hdl32e": 84}  # of other sensors: `STREET_STEP`
+# Weights of these sensors take their scans unchanged. The scans of other sensors are normalised, as
+# scan files are.
+UNCHANGED = ("hdl64e", "hdl32e")
 VAL_STREETS = 6
 FIRST_VAL_STREET = 900_000  # streets with lower numbers are for training
 LAST_STREET = 999_999
@@ -54,17 +59,25 @@ class SimulatedStreets(Dataset):
 
     Args:
         root: the folder of the cache, which is made if it does not exist.
+        sensor: a name in `CLASSES_BY_SENSOR`; "any" stands for another sensor in each scan.
+        normalise: as in `Dataset`; only scans of sensors that are not `UNCHANGED` are normalised.
     """
 
     readers = 1  # two threads would simulate the same street
 
-    def __init__(self, root: Path | str, sensor: str = "hdl64e") -> None:
+    def __init__(
+        self, root: Path | str, sensor: str = "hdl64e", normalise: Normalise | None = None
+    ) -> None:
         super().__init__(root, CLASSES_BY_SENSOR[sensor], f"simulated-{sensor}:{root}")
         self.simulated_sensor = sensor
+        self.normalise = normalise
+        if sensor not in UNCHANGED:
+            self.described_sensor = {"unit": "m", "axes": "x-forward"}
 
     def parts(self) -> dict[str, tuple[str, ...]]:
         """Return the streets of "train", "val" and "all"."""
-        train = tuple(map(_name, range(TRAIN_STREETS[self.simulated_sensor])))
+        streets = TRAIN_STREETS.get(self.simulated_sensor, STREET_STEP)
+        train = tuple(map(_name, range(streets)))
         val = tuple(map(_name, range(FIRST_VAL_STREET, FIRST_VAL_STREET + VAL_STREETS)))
         return {"train": train, "val": val, "all": (*train, *val)}
 
@@ -83,6 +96,12 @@ class SimulatedStreets(Dataset):
         index = int(record.points_path.name)
         return self._record((number + shift) % FIRST_VAL_STREET, index)
 
+    def normalised_by(self, normalise: Normalise) -> Dataset:
+        """Return the same streets, with scans that are normalised if their sensor asks for it."""
+        if self.simulated_sensor in UNCHANGED:
+            return self
+        return SimulatedStreets(self.root, self.simulated_sensor, normalise)
+
     def having_labels(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
         """Return all scans: labels are simulated with them."""
         return list(records)
@@ -99,6 +118,15 @@ class SimulatedStreets(Dataset):
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan; simulate its street if it is not in the cache."""
+        scan = self._read(record, labels)
+        if self.normalise is None:
+            return scan
+        # Without rings: most files have none, and the scans of a street may be of several sensors.
+        cloud = Cloud(scan.points[:, :3], scan.points[:, 3], name=scan.name)
+        return dataclasses.replace(self.normalise(cloud, scan.name), labels=scan.labels)
+
+    def _read(self, record: ScanRecord, labels: bool) -> Scan:
+        """Return a scan as its sensor writes it; raise the errors of `read`."""
         street = record.points_path.parent
         with suppress(FileNotFoundError):
             os.utime(street)  # marks the street as just read, so that other processes keep it
