@@ -37,6 +37,7 @@ from amvnet import load
 from amvnet import read as read_scan
 from amvnet.cli.main import main as amvnet
 from amvnet.config.nested import to_dict
+from amvnet.config.parts import PARTS
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import (
     ModelConfig,
@@ -52,7 +53,7 @@ from amvnet.inference.timing import STAGES, run_once
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.scan import Scan
-from amvnet.weights.file import PARTS, Weights, part_state, save
+from amvnet.weights.file import Weights, part_state, save
 from lidarstreets import simulate
 
 TINY = ModelConfig(

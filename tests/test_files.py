@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import stat
@@ -12,7 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
+from amvnet.files import alone_in, atomic_write, remove_unfinished
 from amvnet.inference.listing import DatasetScan, FileReader, FileScan, InputScan
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_output
 from amvnet.inference.segmentation import Segmentation
@@ -440,3 +441,37 @@ def test_an_output_folder_that_is_a_file_is_called_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a folder to write to, found a file; give"):
         files.make_folder(path)
     assert path.read_bytes() == PRECIOUS
+
+
+def test_what_killed_runs_left_is_removed_in_all_folders_but_nothing_else(tmp_path: Path) -> None:
+    unfinished = f".{'0123456789abcdef' * 2}.part"
+    (tmp_path / unfinished).mkdir()
+    (tmp_path / unfinished / "weights.bin").write_bytes(b"")
+    kept = []
+    for folder in (tmp_path, tmp_path / "rv", tmp_path / "sequences/00/predictions"):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{unfinished}.label").write_bytes(b"")
+        kept += [folder / "0.label", folder / ".0123.part"]
+    for path in kept:
+        path.write_bytes(PRECIOUS)
+
+    remove_unfinished(tmp_path)
+    assert {path for path in tmp_path.rglob("*") if path.is_file()} == set(kept)
+    assert not (tmp_path / unfinished).exists()
+
+
+def test_a_lock_that_another_run_removed_after_it_was_opened_keeps_nobody_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that ends removes its file, which this one may have opened just before."""
+    lock = fcntl.flock
+
+    def remove_first(file: IO[str], how: int) -> None:
+        monkeypatch.setattr(fcntl, "flock", lock)
+        (tmp_path / ".lock").unlink()
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", remove_first)
+    with alone_in(tmp_path):
+        assert (tmp_path / ".lock").is_file()
+        fails(alone_in(tmp_path).__enter__, tmp_path, "another run")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
+import json
 import os
 import re
 import shutil
 import tempfile
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from amvnet.errors import InputError, shown
 
@@ -25,6 +27,28 @@ LONGEST_NAME = 255  # longest file name in most file systems, bytes
 LONGEST_ENDING = 20  # longest ending that an unfinished file keeps, characters
 
 unfinished: set[Path] = set()  # files and folders to remove if the process exits at once
+
+
+def digest(content: str | Iterable[bytes]) -> str:
+    """Return 16 hexadecimal digits that identify a text, or bytes in one or several pieces."""
+    sha = hashlib.sha256()
+    for piece in [content.encode()] if isinstance(content, str) else content:
+        sha.update(piece)
+    return sha.hexdigest()[:16]
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a value as JSON, whole or not at all."""
+    with atomic_write(path) as part:
+        part.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def write_yaml(path: Path, entries: Mapping[str, Any]) -> None:
+    """Write entries as YAML, in their order, whole or not at all."""
+    import yaml
+
+    with atomic_write(path) as part:
+        part.write_text(yaml.safe_dump(entries, sort_keys=False, width=1000))
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from amvnet.sensors.intensity import SIMULATED_QUANTILES, TrainedIntensity
 from amvnet.sensors.lasers import SensorGeometry, measure_sensor
 from amvnet.sensors.lidars import KNOWN_HEIGHTS, KNOWN_SENSORS, Sensor
 from amvnet.sensors.normalise import Normaliser
-from amvnet.training.expectation import expected_after
+from amvnet.training.expectation import expectation_of
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.commands import fails, succeed
@@ -45,7 +45,7 @@ def trained_at(height: float, root: Path) -> Weights:
     scans = TrainingData([Source(data, data.records(["08"]))])
     weights = fresh_weights()
     recipe = Recipe(model=weights.model, sensor="hdl64e")
-    expects = expected_after(scans, weights, recipe, ("rv", "bev"))
+    expects = expectation_of(scans, weights, recipe, ("rv", "bev"))
     return replace(weights, sensor="hdl64e", expects=expects)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import amvnet
+from amvnet.config.parts import PARTS
 from amvnet.config.schema import RangeViewConfig, Recipe
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.training_data import Source, TrainingData
@@ -30,8 +31,8 @@ from amvnet.sensors.intensity import (
 from amvnet.sensors.lidars import Sensor, rotation_from_degrees
 from amvnet.sensors.measure import MEASURED_SCANS, Recording
 from amvnet.sensors.normalise import Normaliser
-from amvnet.training.expectation import expected_after
-from amvnet.weights.file import PARTS, Weights
+from amvnet.training.expectation import expectation_of
+from amvnet.weights.file import Weights
 
 from fixtures.commands import fails
 from fixtures.sensors import LASERS, ground_height, place
@@ -211,7 +212,7 @@ def measured_intensity(data: SemanticKitti, sequences: Sequence[str]) -> Trained
     """Return the intensities that networks expect which are trained on a dataset from scratch."""
     scans = TrainingData([Source(data, data.records(sequences))])
     weights = without(fresh_weights(), *PARTS)
-    return expected_after(scans, weights, Recipe(), ("rv", "bev")).intensity
+    return expectation_of(scans, weights, Recipe(), ("rv", "bev")).intensity
 
 
 def test_scans_without_intensities_have_quantiles_of_zero_and_equal_ones_are_left_out(

@@ -268,6 +268,24 @@ def test_weights_with_rings_as_rows_get_the_rows_of_the_training(kind: str) -> N
     np.testing.assert_array_equal(rows_in_nuscenes(scan), 31 - laser)
 
 
+def test_rings_that_are_four_rows_off_do_not_decide_the_rows() -> None:
+    """As if a file left out the lowest lasers of the sensor, and numbered the others from 0."""
+    points, laser = place(LASERS["hdl32e"], 1.84)
+    normaliser, _ = make_normaliser(name="hdl32e", is_nuscenes=True)
+    for off in (1, 4):
+        scan = normaliser(make_cloud(points[laser >= off], laser[laser >= off] - off), "a")
+        np.testing.assert_array_equal(rows_in_nuscenes(scan), 31 - laser[laser >= off])
+
+
+def test_points_whose_ring_is_unknown_get_no_row_by_their_ring() -> None:
+    points, laser = place(np.linspace(-20, 12, 32), 1.84)
+    unknown = np.arange(len(laser)) % 7 == 0
+    normaliser, _ = make_normaliser(Sensor(beams=32), "homemade", is_nuscenes=True)
+    row = normaliser(make_cloud(points, np.where(unknown, -1, laser)), "a").row
+    assert row is not None
+    np.testing.assert_array_equal(row, np.where(unknown, -1, 31 - laser))
+
+
 def rows_in_nuscenes(scan: Scan) -> np.ndarray:
     """Return the (N,) rows of a scan in the range image of weights whose rows are rings."""
     view = RangeView(NUSCENES_WEIGHTS.model.range_view)

@@ -14,7 +14,7 @@ from torch import nn
 
 from amvnet.config.schema import HeadTraining, NetworkTraining, Recipe, TrainingConfig
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
-from amvnet.training.run_folder import DONE
+from amvnet.training.run_folder import DONE, RunFolder, StageFolder
 from amvnet.training.stage import _epochs_after
 from amvnet.weights.file import load
 
@@ -108,7 +108,7 @@ def test_the_best_weights_are_the_first_with_the_highest_miou(tmp_path: Path) ->
     range_net = weights.build().range_net
     module: Any = SimpleNamespace(trained=range_net, check_epoch=lambda: None, own_miou=None)
     keep = object.__new__(KeepWeights)
-    keep.folder = tmp_path
+    keep.folder = StageFolder(tmp_path)
     keep.part = "range_net"
     keep.weights = weights
     keep.settings = {}
@@ -185,6 +185,9 @@ def test_the_later_stages_are_those_that_are_not_finished(
     )
     stage: Any = SimpleNamespace(name="rv")
     plan: Any = SimpleNamespace(
-        stages=("rv", "bev", "head"), recipe=Recipe(training=training), resume=resume, out=tmp_path
+        stages=("rv", "bev", "head"),
+        recipe=Recipe(training=training),
+        resume=resume,
+        folder=RunFolder(tmp_path),
     )
     assert _epochs_after(stage, plan) == later

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from amvnet.config.parts import PARTS
 from amvnet.config.recipes import load_recipe
-from amvnet.config.schema import Recipe
+from amvnet.config.schema import Recipe, StageName
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import to_train
@@ -18,14 +19,14 @@ from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import SIMULATED_QUANTILES
 from amvnet.sensors.normalise import Normaliser, normalised
 from amvnet.training.checking import first_weights
-from amvnet.training.expectation import expected_after, expected_before
+from amvnet.training.expectation import expectation_of, with_options
 from amvnet.training.networks import make_loaders
 from amvnet.training.plan import Plan
-from amvnet.weights.file import PARTS, Weights
+from amvnet.weights.file import Weights
 
 from fixtures.tiny import fake_drive, fresh_weights, street, with_intensities, write_recipe
 
-BOTH = ("rv", "bev")
+BOTH: tuple[StageName, ...] = ("rv", "bev")
 
 
 @pytest.fixture(scope="module", params=["with intensity", "without intensity"])
@@ -81,7 +82,7 @@ def test_predict_gives_finished_weights_the_intensities_of_their_training(
 
     data = str(own / "robot.yaml")
     plan = Plan.open(recipe, [data], tmp_path / "run", to_train, init, stage=stage)
-    expects = expected_after(plan.data, first_weights(plan), plan.recipe, plan.stages)
+    expects = expectation_of(plan.data, first_weights(plan), plan.recipe, plan.stages)
     _, val = make_loaders(plan, recipe.training.rv, expects)
     assert val is not None
     in_training = val.dataset[(0, 0)]
@@ -105,10 +106,10 @@ def test_networks_learn_to_do_without_intensities_unless_one_of_them_stays() -> 
         (("range_net",), ("bev",), False),
         (PARTS, ("head",), False),
     ):
-        before = expected_before(known, parts, hiding, stages)
+        before = with_options(known, parts, hiding, stages)
         assert before.intensity is not None
         assert before.intensity.is_optional == expected
-        assert expected_before(before, parts, recipe, stages) == before  # they forget nothing
+        assert with_options(before, parts, recipe, stages) == before  # they forget nothing
 
 
 def test_streets_that_are_joined_with_others_are_matched_as_streets_alone(
@@ -126,7 +127,7 @@ def test_streets_that_are_joined_with_others_are_matched_as_streets_alone(
             recipe, data, tmp_path / "run", lambda each: to_train(each, ["0"], ["900000"])
         )
         weights = Weights(recipe.model, plan.data.taxonomy)
-        found.append(expected_after(plan.data, weights, plan.recipe, plan.stages).intensity)
+        found.append(expectation_of(plan.data, weights, plan.recipe, plan.stages).intensity)
     assert found[0].is_matched
     assert found[0].is_optional  # a quarter of the streets hide their intensities
     assert found[0] == found[1]

@@ -30,7 +30,7 @@ from amvnet.sensors.normalise import Normaliser, normalised
 from amvnet.training import checking
 from amvnet.training.augment import mix
 from amvnet.training.checking import check_data
-from amvnet.training.expectation import expected_after
+from amvnet.training.expectation import expectation_of
 from amvnet.training.loaders import ScanSet, collate
 from amvnet.training.losses import rival_classes
 from amvnet.training.plan import Plan, open_for_training, sized_by_init, without_initial_weights
@@ -263,11 +263,11 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
     own = [normalised(open_dataset(str(path)), Normaliser(weights.expects)) for path in paths]
     a, b = [Source(each, each.records(each.sequences("train"))) for each in own]
 
-    def expected(*sources: Source) -> Expectation:
-        return expected_after(TrainingData(sources), weights, Recipe(), ("rv", "bev"))
+    def expected_of(*sources: Source) -> Expectation:
+        return expectation_of(TrainingData(sources), weights, Recipe(), ("rv", "bev"))
 
-    assert not expected(a, b).as_is
-    assert expected(a, b).sensor == expected(a).sensor
+    assert not expected_of(a, b).as_is
+    assert expected_of(a, b).sensor == expected_of(a).sensor
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from amvnet.config.nested import from_dict
-from amvnet.config.schema import ModelConfig, NetworkTraining, Recipe, TrainingConfig
+from amvnet.config.schema import ModelConfig, NetworkName, NetworkTraining, Recipe, TrainingConfig
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.taxonomy import SEMANTICKITTI
@@ -27,7 +27,7 @@ from amvnet.training.loaders import ScanSet
 from amvnet.training.losses import Targets, dice, distillation_loss, lovasz_softmax
 from amvnet.training.networks import PolarStage, make_loaders, make_stage
 from amvnet.training.plan import Plan
-from amvnet.training.stage import Precision
+from amvnet.training.stage import Precision, StageContext
 
 from fixtures.tiny import MODEL, fresh_weights, street
 
@@ -49,8 +49,8 @@ def plan_with(config: NetworkTraining) -> Plan:
 def polar_stage() -> PolarStage:
     torch.manual_seed(0)
     model = build_amvnet(MODEL_CONFIG, SEMANTICKITTI.size)
-    shared: Any = {"config": CONFIG, "taxonomy": SEMANTICKITTI}
-    return PolarStage(model.polar_view, model.polar_net.eval(), None, **shared)
+    context = StageContext(CONFIG, SEMANTICKITTI)
+    return PolarStage(context, model.polar_view, model.polar_net.eval())
 
 
 def batch_of_two() -> tuple[PointBatch, torch.Tensor]:
@@ -88,7 +88,7 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
-def test_pixels_and_voxels_have_the_source_of_their_points(stage: str) -> None:
+def test_pixels_and_voxels_have_the_source_of_their_points(stage: NetworkName) -> None:
     """The source is the scan here, so that no pixel and no voxel has points of two sources."""
     batch, labels = batch_of_two()
     made = make_stage(plan_with(CONFIG), stage, build_amvnet(MODEL_CONFIG, 19)).eval()
@@ -110,7 +110,9 @@ def test_a_voxel_with_points_of_two_datasets_has_the_first_as_its_source() -> No
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
-def test_on_a_cpu_all_convolutions_of_a_training_step_have_channels_last(stage: str) -> None:
+def test_on_a_cpu_all_convolutions_of_a_training_step_have_channels_last(
+    stage: NetworkName,
+) -> None:
     config = replace(MODEL_CONFIG, range_net=replace(MODEL_CONFIG.range_net, steps=True))
     plan = plan_with(CONFIG)
     training = replace(plan.recipe.training, accelerator="cpu")
@@ -135,7 +137,7 @@ def test_on_a_cpu_all_convolutions_of_a_training_step_have_channels_last(stage: 
     ("precision", "lower"), [("bf16-mixed", torch.bfloat16), ("16-mixed", torch.float16)]
 )
 def test_a_network_alone_computes_in_the_lower_precision(
-    stage: str, precision: Precision, lower: torch.dtype
+    stage: NetworkName, precision: Precision, lower: torch.dtype
 ) -> None:
     """What the network returns has the lower precision; what the loss compares is float32."""
     view = replace(MODEL_CONFIG.range_view, hidden=0.5)
@@ -157,7 +159,7 @@ def test_a_network_alone_computes_in_the_lower_precision(
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
-def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> None:
+def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: NetworkName) -> None:
     model = build_amvnet(MODEL_CONFIG, 19)
     made: Any = make_stage(plan_with(CONFIG), stage, model, None, RIVALS).eval()
     made.log = lambda *_, **__: None
@@ -176,7 +178,9 @@ def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: str) -> No
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
-def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(stage: str) -> None:
+def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(
+    stage: NetworkName,
+) -> None:
     config = replace(CONFIG, distill=2.0)
     plan, model = plan_with(config), build_amvnet(MODEL_CONFIG, 19)
     assert not make_stage(plan, stage, model).teachers
@@ -204,7 +208,7 @@ def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(stage
 @pytest.mark.parametrize("name", ["default", "dice", "lovasz"])
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_the_loss_of_a_stage_equals_its_formula_with_all_weights(
-    stage: str, name: Literal["default", "dice", "lovasz"]
+    stage: NetworkName, name: Literal["default", "dice", "lovasz"]
 ) -> None:
     """Class weights, the weight of the region loss, and the recipe's region loss or the paper's."""
     config = replace(CONFIG, region=0.3, region_loss=name)

@@ -7,17 +7,19 @@ from typing import Any
 import pytest
 import torch
 
+from amvnet.config.parts import PARTS
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.config.schema import TrainingConfig
 from amvnet.runtime.distributed import device_of
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.stage import precision_of
-from amvnet.weights.file import PARTS, load, save
+from amvnet.weights.file import load, save
 
 from fixtures.commands import run_cli
 from fixtures.tiny import GOLDEN, fresh_weights, make_streets, write_recipe
 
 MIXED = ("bf16-mixed", "16-mixed")
+AUTO = TrainingConfig(precision="auto")
 
 
 @pytest.mark.parametrize(
@@ -28,12 +30,12 @@ def test_auto_is_bfloat16_where_the_processor_multiplies_it(
     monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], expected: str
 ) -> None:
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
-    assert precision_of(TrainingConfig(precision="auto", accelerator="cpu")) == expected
+    assert precision_of(AUTO, "cpu") == expected
 
 
 def test_a_torch_that_does_not_tell_trains_in_32_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
-    assert precision_of(TrainingConfig(precision="auto", accelerator="cpu")) == "32-true"
+    assert precision_of(AUTO, "cpu") == "32-true"
 
 
 @pytest.mark.parametrize("includes_bfloat16", [True, False])
@@ -43,17 +45,16 @@ def test_a_gpu_is_asked_without_emulation(
     def is_bf16_supported(including_emulation: bool = True) -> bool:
         return including_emulation or includes_bfloat16
 
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", is_bf16_supported)
     expected = "bf16-mixed" if includes_bfloat16 else "32-true"
-    assert precision_of(TrainingConfig(precision="auto", accelerator="gpu")) == expected
+    assert precision_of(AUTO, "cuda") == expected
 
 
 def test_a_mac_trains_on_its_gpu_in_32_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     assert [device_of(name) for name in ("auto", "gpu", "cpu")] == ["mps", "mps", "cpu"]
-    assert precision_of(TrainingConfig(precision="auto", accelerator="gpu")) == "32-true"
+    assert precision_of(AUTO, "mps") == "32-true"
 
 
 def recipes_in_mixed_precision() -> list[Any]:

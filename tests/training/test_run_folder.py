@@ -15,10 +15,9 @@ from amvnet.training.run_folder import (
     LAST,
     MAX_CHANGES,
     SETTINGS,
-    check_begun,
-    check_folder,
+    RunFolder,
+    StageFolder,
     describe_changes,
-    stage_settings,
 )
 
 from fixtures.commands import fails
@@ -53,7 +52,7 @@ def test_settings_tell_classes_apart_by_names_order_and_ids(tmp_path: Path) -> N
         path = tmp_path / f"{len(found)}.yaml"
         path.write_text(yaml.safe_dump({"classes": classes, "scans": "*.bin"}, sort_keys=False))
         data = TrainingData([Source(open_own(path), [])])
-        settings = stage_settings(Plan(Recipe(), data, tmp_path / "run"), "rv", fresh_weights())
+        settings = Plan(Recipe(), data, tmp_path / "run").settings("rv", fresh_weights())
         found.add(settings["classes"])
     assert len(found) == 4
 
@@ -64,30 +63,33 @@ def test_settings_tell_classes_apart_by_names_order_and_ids(tmp_path: Path) -> N
     )
     for other in (first, second):
         plan = Plan(Recipe(), TrainingData([first, other]), tmp_path / "run")
-        found.add(stage_settings(plan, "rv", fresh_weights())["classes"])
+        found.add(plan.settings("rv", fresh_weights())["classes"])
     assert len(found) == 6
 
 
 def test_no_run_begins_in_the_folder_of_a_dataset(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(bytes(160))
     (tmp_path / "own.yaml").write_text(yaml.safe_dump({"classes": {"a": 1}, "scans": "*.bin"}))
-    data = TrainingData([Source(open_own(tmp_path / "own.yaml"), [])])
+    own = open_own(tmp_path / "own.yaml")
     make_semantickitti(tmp_path / "kitti")
     for folder in (tmp_path, tmp_path / "x/..", tmp_path / "kitti"):
-        fails(partial(check_folder, Plan(Recipe(), data, folder)), folder, "a dataset")
-    check_folder(Plan(Recipe(), data, tmp_path / "run"))
+        run = RunFolder(folder)
+        fails(partial(run.check_place, [own.root], []), folder, "a dataset")
+    RunFolder(tmp_path / "run").check_place([own.root], [])
 
 
 def test_a_refused_resume_says_which_values_differ(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path)
+    folder.check_begun(EARLIER)
     (tmp_path / LAST).write_bytes(b"")
     (tmp_path / SETTINGS).write_text(yaml.safe_dump(EARLIER))
     settings = {**EARLIER, "training": {"rv": {"lr": 0.001, "batch": 2}, "seed": 0}}
-    fails(lambda: check_begun(tmp_path, settings, True), "training.rv.lr 0.001 instead of 0.003")
+    fails(lambda: folder.check_begun(settings), "training.rv.lr 0.001 instead of 0.003")
 
     # Without the earlier settings, everything differs.
     for text in ("", "a: [", "- 1"):
         (tmp_path / SETTINGS).write_text(text)
-        fails(lambda: check_begun(tmp_path, EARLIER, True), "model.range_net.widths")
+        fails(lambda: folder.check_begun(EARLIER), "model.range_net.widths")
     (tmp_path / SETTINGS).unlink()
     many = {**EARLIER, "model": {str(index): index for index in range(2 * MAX_CHANGES)}}
-    fails(lambda: check_begun(tmp_path, many, True), "and ", " more")
+    fails(lambda: folder.check_begun(many), "and ", " more")

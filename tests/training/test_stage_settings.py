@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from amvnet.config.schema import NetworkTraining, PointHeadConfig
+from amvnet.config.schema import HeadTraining, NetworkTraining, PointHeadConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
@@ -21,6 +21,7 @@ from amvnet.training import networks
 from amvnet.training.head import HeadStage
 from amvnet.training.losses import class_weights
 from amvnet.training.networks import NetworkStage
+from amvnet.training.stage import StageContext
 from amvnet.weights.file import save
 
 from fixtures.commands import run_cli
@@ -73,14 +74,8 @@ def test_a_stage_has_the_class_weights_of_its_scans_if_the_recipe_says_so(
 
 def test_the_loss_of_the_head_equals_its_formula() -> None:
     net = PointHead(PointHeadConfig(neighbours=4, hidden=(8, 8), fc=8), 19)
-    config = SimpleNamespace(epochs=1, lr=0.1)
-    stage = HeadStage(
-        net,
-        None,  # type: ignore[arg-type]  # no points: the batch is given
-        None,
-        config=config,
-        taxonomy=SEMANTICKITTI,
-    )
+    points: Any = None  # the batch is given
+    stage = HeadStage(StageContext(HeadTraining(epochs=1), SEMANTICKITTI), net, points, None)
     trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     stage.trainer = trainer
     stage.log = lambda *_, **options: None  # type: ignore[method-assign]
@@ -159,7 +154,7 @@ def test_every_scan_of_a_step_has_the_same_share_of_its_gradient(
     """Also in the last step of an epoch, which may have fewer parts, and one with fewer scans."""
     config = NetworkTraining(epochs=1, batch=batch * parts, lr=1e-3)
     view: Any = None
-    stage = NetworkStage(view, torch.nn.Linear(1, 1), None, config=config, taxonomy=SEMANTICKITTI)
+    stage = NetworkStage(StageContext(config, SEMANTICKITTI), view, torch.nn.Linear(1, 1))
     loader = SimpleNamespace(batch_size=batch, sampler=range(scans))
     trainer: Any = SimpleNamespace(accumulate_grad_batches=parts, train_dataloader=loader)
     stage._trainer = trainer

@@ -20,6 +20,7 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from amvnet.config.parts import PARTS
 from amvnet.config.recipes import load_recipe
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
@@ -35,7 +36,7 @@ from amvnet.training.curves import Curves, draw_curves, read_curves
 from amvnet.training.head_points import PointGatherer
 from amvnet.training.networks import NetworkStage, train_network
 from amvnet.training.plan import Plan
-from amvnet.weights.file import PARTS, Weights, load, save
+from amvnet.weights.file import Weights, load, save
 
 from fixtures.commands import files, refusal, refused, run_cli, succeed
 from fixtures.processes import Printed, become_cli, fork_server, start_cli
@@ -254,7 +255,7 @@ def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: 
     on_train_epoch_end = KeepWeights.on_train_epoch_end
 
     def stop(self: KeepWeights, trainer: Any, module: Any) -> None:
-        if self.folder.name == stage and trainer.current_epoch == epoch:
+        if self.folder.path.name == stage and trainer.current_epoch == epoch:
             raise RuntimeError("the power is gone")
         on_train_epoch_end(self, trainer, module)
 

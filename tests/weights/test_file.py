@@ -18,9 +18,10 @@ from torch import Tensor
 import amvnet
 import amvnet.weights
 from amvnet.config.nested import to_dict
+from amvnet.config.parts import PARTS
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.weights.file import PARTS, Weights, built_in, load, save
+from amvnet.weights.file import Weights, built_in, load, save
 
 from fixtures.tiny import fresh_weights, street
 

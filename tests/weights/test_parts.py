@@ -9,10 +9,11 @@ import pytest
 import torch
 
 import amvnet
+from amvnet.config.parts import PARTS
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
 from amvnet.models.methods import MethodName
-from amvnet.weights.file import PARTS, Weights
+from amvnet.weights.file import Weights
 from amvnet.weights.parts import for_classes, replace_part
 
 from fixtures.tiny import fresh_weights, street, without

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, overload
 
 from amvnet.config.bounds import Bounded, Range, Seed, Share
 
-StageName = Literal["rv", "bev", "head"]
+NetworkName = Literal["rv", "bev"]  # of a stage that trains a network
+StageName = Literal[NetworkName, "head"]
 
 # These limits are far above any use. They keep a stranger's weights file or recipe from filling the
 # memory.
@@ -396,6 +397,16 @@ class TrainingConfig(Bounded):
     bfloat16 arithmetic, 32-true on others. 64-true serves to compare trainings."""
     accelerator: str = "auto"
     """Lightning's accelerator: auto, cpu or gpu."""
+
+    @overload
+    def of(self, stage: NetworkName) -> NetworkTraining: ...
+    @overload
+    def of(self, stage: StageName) -> NetworkTraining | HeadTraining: ...
+    def of(self, stage: StageName) -> NetworkTraining | HeadTraining:
+        """Return the training of a stage."""
+        if stage == "head":
+            return self.head
+        return self.rv if stage == "rv" else self.bev
 
 
 @dataclass(frozen=True)

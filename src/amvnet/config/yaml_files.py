@@ -105,3 +105,12 @@ class _BoundedLoader(yaml.SafeLoader):
         if node.tag in NUMBERS and ":" in node.value:
             raise yaml.YAMLError(f"{node.value[:50]}, write a number without : or a text in quotes")
         return super().construct_scalar(node)
+
+
+def read_entries(path: Path) -> dict[str, Any]:
+    """Return what `write_yaml` wrote; nothing if the file is missing or holds anything else."""
+    try:
+        entries = parse_yaml(path.read_text(), f"{path}: expected entries")
+    except (OSError, ValueError):
+        return {}
+    return entries if isinstance(entries, dict) else {}

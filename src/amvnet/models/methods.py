@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from amvnet.config.parts import BOTH_NETWORKS, PART_OF, PARTS
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
 MethodName = Literal["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 # Takes the class probabilities f and g (P, K) of the two networks, and returns one (P, K).
 Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]
-
-
-BOTH_NETWORKS = ("range_net", "polar_net")  # names of the two networks' parts in weights
 
 
 def geometric_mean(f: Tensor, g: Tensor) -> Tensor:
@@ -59,13 +57,13 @@ class Method:
 
 # All methods by name, in the order of the paper's tables.
 METHODS: dict[str, Method] = {
-    "rv": Method("RV", ("range_net",)),
-    "rv-knn": Method("RV + kNN", ("range_net",)),
-    "bev": Method("BEV", ("polar_net",)),
+    "rv": Method(PART_OF["rv"].short, (PART_OF["rv"].name,)),
+    "rv-knn": Method(f"{PART_OF['rv'].short} + kNN", (PART_OF["rv"].name,)),
+    "bev": Method(PART_OF["bev"].short, (PART_OF["bev"].name,)),
     "arithmetic": Method("arithmetic mean", BOTH_NETWORKS, arithmetic_mean),
     "maximum": Method("maximum", BOTH_NETWORKS, maximum),
     "ensemble": Method("ensemble", BOTH_NETWORKS, geometric_mean),
-    "amvnet": Method("AMVNet", (*BOTH_NETWORKS, "point_head")),
+    "amvnet": Method("AMVNet", PARTS),
 }
 # Methods in the paper's Tables 3 and 4.
 PAPER_METHODS: tuple[MethodName, ...] = ("rv", "bev", "ensemble", "amvnet")

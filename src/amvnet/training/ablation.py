@@ -10,16 +10,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from amvnet.config.parts import BOTH_NETWORKS
 from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.engines.precision import choose_device
 from amvnet.evaluation.analysis import SweptRow, swept_row
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.loading import load
-from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.training.plan import Plan
 from amvnet.training.run import train
-from amvnet.training.run_folder import is_run
+from amvnet.training.run_folder import RunFolder
 from amvnet.weights.file import Weights
 from amvnet.weights.parts import replace_part
 
@@ -78,7 +78,7 @@ def _networks(weights: Weights, model: ModelConfig) -> Weights:
 
 def is_begun(out: Path) -> bool:
     """Return whether an earlier call of `ablate` has trained in a folder."""
-    return any(is_run(out / _name(gru, weighted)) for gru, weighted in VARIANTS)
+    return any(RunFolder(out / _name(gru, weighted)).is_run for gru, weighted in VARIANTS)
 
 
 def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[str, Any]]]:

@@ -27,7 +27,6 @@ from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.training.plan import Plan, sized_by_init
 from amvnet.training.run import train
-from amvnet.training.run_folder import check_folder, is_run
 from amvnet.weights.file import Weights, load, save
 
 TEACHER = "teacher"  # the folder of the labels that teach, in the folder of the run
@@ -203,8 +202,8 @@ def adapt(
     folder = plan.out / TEACHER
     before = _read_figures(folder, request, plan.resume)
     if before is None:
-        check_folder(plan)
-        if is_run(plan.out) or os.path.lexists(folder):
+        plan.folder.check_place(plan.roots, plan.also_read)
+        if plan.folder.is_run or os.path.lexists(folder):
             raise InputError(
                 f"{plan.out}: expected a new folder or the folder of an earlier adapt, found "
                 f"another run or {TEACHER}; give another folder"

@@ -13,10 +13,11 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
+from amvnet.config.parts import PART_OF
+from amvnet.config.schema import StageName
 from amvnet.progress import Reporter
 from amvnet.training.plan import Plan
-from amvnet.training.run_folder import PART_OF, SETTINGS, stage_record, stage_settings, write_yaml
-from amvnet.weights.file import Weights, part_state, save
+from amvnet.weights.file import Weights, part_state
 
 
 class AverageWeights(Callback):
@@ -101,12 +102,12 @@ class KeepWeights(Callback):
     `own_miou` if it has one. If nothing is validated, they are the last ones.
     """
 
-    def __init__(self, plan: Plan, name: str, weights: Weights) -> None:
-        self.folder = plan.out / name
-        self.part = PART_OF[name]
+    def __init__(self, plan: Plan, name: StageName, weights: Weights) -> None:
+        self.folder = plan.folder.stages[name]
+        self.part = PART_OF[name].name
         self.weights = weights
-        self.settings = stage_settings(plan, name, weights)
-        self.record = stage_record(plan, self.settings)
+        self.settings = plan.settings(name, weights)
+        self.record = plan.stage_record(self.settings)
         self.started = time.monotonic()  # unlike the system's clock, it is never set back
         self.seconds_before = 0.0  # the time of earlier calls, of which this one continues the last
         self.highest = -1.0  # mIoU of the best weights so far, in [0, 1]
@@ -138,10 +139,8 @@ class KeepWeights(Callback):
             for callback in trainer.callbacks:  # type: ignore[attr-defined]
                 if isinstance(callback, AverageWeights):
                     state = callback.weights()
-            trained = self._trained(state, metrics)
-            for name in ("last", "best") if is_best else ("last",):
-                save(trained, self.folder / f"{name}.safetensors")
-            write_yaml(self.folder / SETTINGS, self.settings)
+            kept = ("last", "best") if is_best else ("last",)
+            self.folder.write(self._trained(state, metrics), kept, self.settings)
 
     def _trained(self, state: dict[str, Tensor], metrics: dict[str, float]) -> Weights:
         """Return weights that hold only the trained part, given its parameters."""

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from amvnet.config.parts import PART_OF
 from amvnet.data.check import check_scans
 from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.training_data import TrainingData
 from amvnet.progress import Progress, Tenths
 from amvnet.sensors.expectation import Expectation
-from amvnet.training.expectation import expected_after
+from amvnet.training.expectation import expectation_of
 from amvnet.training.plan import Plan
-from amvnet.training.run_folder import (
-    PART_OF,
-    check_begun,
-    stage_settings,
-    stages_of_folder,
-    with_finished,
-)
 from amvnet.weights.file import Weights
 from amvnet.weights.parts import differences, for_classes, head_fits, replace_part, resized
 
@@ -45,6 +41,11 @@ class Checked:
     class_counts: np.ndarray
     taught: np.ndarray
 
+    def counts(self, data: TrainingData) -> dict[str, Any]:
+        """Return the class counts as the record of a run has them, with the scans and classes."""
+        scans = [record.name for record in data.train]
+        return {"counts": self.class_counts, "scans": scans, "classes": data.taxonomy.classes}
+
 
 def check(plan: Plan) -> Checked:
     """Check all stages of a plan before anything is written, and before hours are spent on one.
@@ -53,11 +54,12 @@ def check(plan: Plan) -> Checked:
         InputError: if a stage cannot begin or be resumed, or `check_data` finds an error.
     """
     weights = first_weights(plan)
-    for name in plan.stages:
-        check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
+    for name, folder in plan.folder.stages.items():
+        if name in plan.stages:
+            folder.check_begun(plan.settings(name, weights) if plan.resume else None)
     counts, taught = check_data(plan)
     plan.processes.wait()  # until all streets of the first epoch are simulated
-    expects = plan.expects or expected_after(plan.data, weights, plan.recipe, plan.stages)
+    expects = plan.expects or expectation_of(plan.data, weights, plan.recipe, plan.stages)
     return Checked(weights, expects, counts, taught)
 
 
@@ -73,8 +75,8 @@ def first_weights(plan: Plan) -> Weights:
     has_classes = init.taxonomy.classes == taxonomy.classes
     seed = plan.recipe.training.seed
     begun, new = (init, []) if has_classes else for_classes(init, taxonomy, seed)
-    for name in stages_of_folder(plan):
-        part = PART_OF[name]
+    for name in plan.folder.held:
+        part = PART_OF[name].name
         is_trained = name in plan.stages
         if part not in begun.parts or not (is_trained or has_classes):
             continue
@@ -95,7 +97,7 @@ def first_weights(plan: Plan) -> Weights:
                 f"{part}: the initial weights ({init.taxonomy.name}), with new layers for the "
                 f"classes of {taxonomy.name}: {of_part}"
             )
-    return with_finished(plan, weights)
+    return plan.folder.with_finished(weights)
 
 
 def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
@@ -115,10 +117,10 @@ def check_data(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     taught = []
     for number, source in enumerate(plan.data.sources):
         dataset = source.dataset
+        progress = _progress(plan, dataset)
         in_epoch = plan.data.in_epoch(number)
         train = in_epoch if dataset.simulated_sensor else source.train
         splits = {"train": train, "val": source.val}
-        progress = _progress(plan, dataset)
         checked = check_scans(dataset, splits, progress, plan.processes)
         checked.require_trainable()
         totals += checked.count_points(in_epoch)

@@ -6,7 +6,8 @@ import dataclasses
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 
-from amvnet.config.schema import Recipe
+from amvnet.config.parts import BOTH_NETWORKS, NETWORK_STAGES, PART_OF
+from amvnet.config.schema import Recipe, StageName
 from amvnet.data.datasets.training_data import TrainingData
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
@@ -24,24 +25,36 @@ from amvnet.sensors.lidars import ANY
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
 
-NETWORK_OF = {"rv": "range_net", "bev": "polar_net"}  # the network that a stage trains
 # Largest number of scans that are measured; it is enough for the mean height of simulated sensors.
 SAMPLED_SCANS = 60
 # Networks need no intensity if they were trained with this share of their scans without it.
 BLIND_SHARE = 0.2
 
 
-def expected_before(
-    known: Expectation, parts: Collection[str], recipe: Recipe, stages: Sequence[str]
+def expectation_of(
+    data: TrainingData, weights: Weights, recipe: Recipe, stages: Sequence[StageName]
 ) -> Expectation:
-    """Return what networks expect, before the scans of their training are measured.
+    """Return what networks expect after the training of some stages."""
+    if set(BOTH_NETWORKS) & set(weights.parts) and not _networks(stages):
+        return weights.expects  # a head takes what its networks take
+    found = measured(data, weights.expects, recipe.sensor)
+    return with_options(found, weights.parts, recipe, stages)
+
+
+def with_options(
+    known: Expectation, parts: Collection[str], recipe: Recipe, stages: Sequence[StageName]
+) -> Expectation:
+    """Return what networks expect that are trained with the view and augmentation of a recipe.
 
     If the augmentation often hides the intensities, the networks learn to do without them. A
     network that stays as it is does not.
+
+    Args:
+        parts: the parts to begin with.
     """
     hides = recipe.training.augment.no_intensity >= BLIND_SHARE
     trained = _networks(stages)
-    stay = not trained or set(NETWORK_OF.values()) & set(parts) - trained
+    stay = not trained or set(BOTH_NETWORKS) & set(parts) - trained
     intensity = known.intensity
     if intensity is not None and hides and not stay:
         intensity = dataclasses.replace(intensity, is_optional=True)
@@ -53,16 +66,15 @@ def expected_before(
     )
 
 
-def expected_after(
-    data: TrainingData, weights: Weights, recipe: Recipe, stages: Sequence[str]
-) -> Expectation:
-    """Return what networks expect after their training, measured on its scans."""
-    if set(NETWORK_OF.values()) & set(weights.parts) and not _networks(stages):
-        return weights.expects  # a head takes what its networks take
+def measured(data: TrainingData, known: Expectation, sensor: str) -> Expectation:
+    """Return what is known of the scans that networks expect, as measured on scans to train on.
 
+    Args:
+        known: what is expected of scans before they are measured.
+        sensor: the name of their sensor.
+    """
     first = data.sources[0].dataset
     sampled = _sample(data)
-    known = weights.expects
     as_is = True
     geometry = measure_sensor(sampled)
     if isinstance(first.normalise, Normaliser):
@@ -81,14 +93,13 @@ def expected_after(
         if quantiles == NO_INTENSITY or are_quantiles(quantiles):
             intensity = TrainedIntensity(quantiles, is_optional)
 
-    sensor = trained_sensor(recipe.sensor, geometry)
-    known = dataclasses.replace(known, sensor=sensor, intensity=intensity, as_is=as_is)
-    return expected_before(known, weights.parts, recipe, stages)
+    trained = trained_sensor(sensor, geometry)
+    return dataclasses.replace(known, sensor=trained, intensity=intensity, as_is=as_is)
 
 
-def _networks(stages: Sequence[str]) -> set[str]:
+def _networks(stages: Sequence[StageName]) -> set[str]:
     """Return the parts of the networks that some stages train."""
-    return {NETWORK_OF[name] for name in stages if name in NETWORK_OF}
+    return {PART_OF[name].name for name in NETWORK_STAGES if name in stages}
 
 
 def _sample(data: TrainingData) -> list[Scan]:

@@ -12,14 +12,14 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
+from amvnet.config.parts import BOTH_NETWORKS
 from amvnet.config.schema import HeadTraining
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
-from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.point_head import PointHead
 from amvnet.training.head_points import HeadBatch, HeadPoints, PointGatherer, PointSampler
 from amvnet.training.plan import Plan
-from amvnet.training.stage import Loaders, Stage, fit
+from amvnet.training.stage import Loaders, Stage, StageContext, fit
 from amvnet.weights.file import UNCERTAIN, Weights
 
 VAL_FACTOR = 64  # size of a validation batch, in training batches
@@ -28,17 +28,16 @@ VAL_FACTOR = 64  # size of a validation batch, in training batches
 class HeadStage(Stage):
     """Stage `head`. It learns from scores that were gathered beforehand by frozen networks.
 
-    It always computes in float32: it is so small that a lower precision would save nothing. Without
-    `val`, nothing is validated.
+    Without `val`, nothing is validated.
     """
 
     name = "head"
     config: HeadTraining
 
     def __init__(
-        self, head: PointHead, train: HeadPoints, val: HeadPoints | None, **shared: Any
+        self, context: StageContext, head: PointHead, train: HeadPoints, val: HeadPoints | None
     ) -> None:
-        super().__init__(**shared)
+        super().__init__(context)
         self.trained: PointHead = head
         self.train_points = train
         self.val_points = val
@@ -103,7 +102,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
     """
     training = plan.recipe.training
     config = training.head
-    folder = plan.out / "head"
+    folder = plan.folder.stages["head"].path
 
     if plan.scores is None:  # other models have not scored the scans already
         for part in BOTH_NETWORKS:
@@ -122,14 +121,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
 
     model = plan.build(weights)
     assert model.point_head is not None
-    stage = HeadStage(
-        model.point_head,
-        train,
-        val,
-        config=config,
-        taxonomy=plan.data.taxonomy,
-        processes=plan.processes,
-    )
+    stage = HeadStage(StageContext.of(plan, "head"), model.point_head, train, val)
     fit(stage, plan, _make_loaders(plan, train, val), weights)
 
     # Remove the gathered points, which take much space, when no process needs them any more.

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from amvnet.config.schema import NetworkTraining
+from amvnet.config.schema import NetworkName, NetworkTraining
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
 from amvnet.models.amvnet import AMVNet
@@ -18,7 +18,6 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import counted
-from amvnet.runtime.distributed import device_of
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.checking import Checked
 from amvnet.training.loaders import ScanSet, make_loader
@@ -35,7 +34,7 @@ from amvnet.training.losses import (
 )
 from amvnet.training.muon import Muon
 from amvnet.training.plan import Plan
-from amvnet.training.stage import HALF, MIXED, Loaders, Stage, fit, precision_of
+from amvnet.training.stage import HALF, MIXED, Loaders, Stage, StageContext, fit
 from amvnet.weights.file import Weights
 
 Batch = tuple[PointBatch, Tensor, Tensor]  # points, their (P,) train ids and (P,) sources
@@ -63,14 +62,15 @@ class NetworkStage(Stage):
 
     def __init__(
         self,
+        context: StageContext,
         view: RangeView | PolarView,
         net: nn.Module,
-        weights: np.ndarray | None,
+        weights: np.ndarray | None = None,
+        *,
         rivals: np.ndarray | None = None,
         teacher: nn.Module | None = None,
-        **shared: Any,
     ) -> None:
-        super().__init__(**shared)
+        super().__init__(context)
         # In a tuple, the teacher is not a part of the stage, so that no checkpoint holds it.
         self.teachers = () if teacher is None else (teacher.eval().requires_grad_(False),)
         self.view = view
@@ -258,23 +258,23 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tenso
     )
 
 
-def train_network(plan: Plan, checked: Checked, name: str, weights: Weights) -> None:
+def train_network(plan: Plan, checked: Checked, name: NetworkName, weights: Weights) -> None:
     """Train a network in the stage `rv` or `bev`, and write its weights after each epoch.
 
     Raises:
         InputError: if the weights do not fit the recipe, a scan is broken, or the memory of the GPU
             is too small.
     """
-    config = getattr(plan.recipe.training, name)
-    model = plan.build(weights)
+    config = plan.recipe.training.of(name)
     loaders = make_loaders(plan, config, weights.expects)
     # The class weights of the loss (section 4.2 of the paper).
     power = config.class_weights
     loss_weights = class_weights(checked.class_counts, power) if power else None
     rivals = rival_classes(checked.taught)
-    stage = make_stage(plan, name, model, loss_weights, rivals)
     for line in _notes(plan, name, checked.taught, rivals):
         plan.report(line)
+
+    stage = make_stage(plan, name, plan.build(weights), loss_weights, rivals)
     try:
         fit(stage, plan, loaders, weights)
     except torch.OutOfMemoryError:
@@ -285,9 +285,11 @@ def train_network(plan: Plan, checked: Checked, name: str, weights: Weights) -> 
         ) from None
 
 
-def _notes(plan: Plan, name: str, taught: np.ndarray, rivals: np.ndarray | None) -> Iterator[str]:
+def _notes(
+    plan: Plan, name: NetworkName, taught: np.ndarray, rivals: np.ndarray | None
+) -> Iterator[str]:
     """Yield lines about classes that a dataset lacks, and about scans that no epoch uses."""
-    config = getattr(plan.recipe.training, name)
+    config = plan.recipe.training.of(name)
     sources = plan.data.sources
 
     def listed(row: Any) -> str:
@@ -320,7 +322,7 @@ def _notes(plan: Plan, name: str, taught: np.ndarray, rivals: np.ndarray | None)
 
 def make_stage(
     plan: Plan,
-    name: str,
+    name: NetworkName,
     model: AMVNet,
     weights: np.ndarray | None = None,
     rivals: np.ndarray | None = None,
@@ -330,25 +332,16 @@ def make_stage(
     Args:
         weights, rivals: as `NetworkStage` takes them.
     """
-    config = getattr(plan.recipe.training, name)
-    shared: dict[str, Any] = {
-        "config": config,
-        "taxonomy": plan.data.taxonomy,
-        "weights": weights,
-        "rivals": rivals,
-        "processes": plan.processes,
-        "report": plan.report,
-        "precision": precision_of(plan.recipe.training),
-    }
+    context = StageContext.of(plan, name)
     net = model.range_net if name == "rv" else model.polar_net
     # On a CPU, convolutions are faster if channels are last in memory. They follow their kernels.
-    if device_of(plan.recipe.training.accelerator) == "cpu":
+    if context.device == "cpu":
         net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    if config.distill and rivals is not None:
-        shared["teacher"] = copy.deepcopy(net)
+    distils = plan.recipe.training.of(name).distill and rivals is not None
+    teacher = copy.deepcopy(net) if distils else None
     if name == "rv":
-        return RangeStage(model.range_view, net, **shared)
-    return PolarStage(model.polar_view, net, **shared)
+        return RangeStage(context, model.range_view, net, weights, rivals=rivals, teacher=teacher)
+    return PolarStage(context, model.polar_view, net, weights, rivals=rivals, teacher=teacher)
 
 
 def make_loaders(plan: Plan, config: NetworkTraining, expects: Expectation) -> Loaders:

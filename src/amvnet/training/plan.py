@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import platform
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-from amvnet.config.schema import Recipe, StageName
+from amvnet.config.nested import to_dict
+from amvnet.config.parts import BOTH_NETWORKS, NETWORK_STAGES, PART_OF
+from amvnet.config.schema import NetworkName, Recipe, StageName
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import to_mix_in
-from amvnet.data.datasets.training_data import Source, TrainingData
+from amvnet.data.datasets.training_data import (
+    Source,
+    TrainingData,
+    digest_of_scans,
+    sequence_names,
+)
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.inference.scores import ScorePair
@@ -22,9 +31,11 @@ from amvnet.progress import Reporter, counted, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.normalise import Normaliser, normalised
-from amvnet.training.expectation import NETWORK_OF, expected_before
-from amvnet.weights.file import Weights, read
+from amvnet.training.expectation import with_options
+from amvnet.training.run_folder import RunFolder
+from amvnet.weights.file import Weights
 
+PACKAGES = ("amvnet", "torch", "lightning", "numpy")  # the packages whose versions are recorded
 MAX_MEASURED_RECORDINGS = 20  # largest number of a user's recordings that are measured
 
 
@@ -76,8 +87,8 @@ class Plan:
                 f"expected a validation scan for each of {size} processes, found {len(val)}; "
                 "name more validation sequences"
             )
-        for name in ("rv", "bev"):
-            config = getattr(self.recipe.training, name)
+        for name in NETWORK_STAGES:
+            config = self.recipe.training.of(name)
             if config.batch % (size * config.accumulate):
                 raise InputError(
                     f"expected a batch that {counted(size, 'process', 'processes')} can share, "
@@ -94,13 +105,14 @@ class Plan:
                 f"found {taxonomy}; use the recipe of that benchmark"
             )
 
-        for name in self.stages:
-            if name in NETWORK_OF:
-                self._check_initial(name, NETWORK_OF[name])
+        for name in NETWORK_STAGES:
+            if name in self.stages:
+                self._check_initial(name)
 
-    def _check_initial(self, name: str, part: str) -> None:
+    def _check_initial(self, name: NetworkName) -> None:
         """Raise InputError if the network of a stage needs initial weights and there are none."""
-        config = getattr(self.recipe.training, name)
+        config = self.recipe.training.of(name)
+        part = PART_OF[name].name
         parts = self.init.parts if self.init else ()
         for option in ("initial", "distill"):
             if getattr(config, option) and part not in parts:
@@ -112,9 +124,74 @@ class Plan:
                 )
 
     @property
-    def stages(self) -> tuple[str, ...]:
+    def stages(self) -> tuple[StageName, ...]:
         """The stages to train, in order."""
         return self.recipe.stages if self.stage == "all" else (self.stage,)
+
+    @property
+    def roots(self) -> list[Path]:
+        """The folders of the datasets."""
+        return [source.dataset.root for source in self.data.sources]
+
+    @property
+    def folder(self) -> RunFolder:
+        """The folder of the run."""
+        # The networks of a folder cannot use a head that was trained on other models' scores.
+        held: tuple[StageName, ...] = tuple(PART_OF) if self.scores is None else ("head",)
+        return RunFolder(self.out, held, self.recipe.training.keep)
+
+    def settings(self, name: StageName, weights: Weights) -> dict[str, Any]:
+        """Return all settings that the trained weights of a stage depend on, as a tree for YAML.
+
+        Paths are left out, so that the data may move to another folder before the stage is resumed.
+
+        Args:
+            weights: the weights that the stage begins with.
+        """
+        recipe = to_dict(self.recipe)
+        training_keys = (name, "augment", "seed", "precision")
+        part = PART_OF[name].name
+        train, val = self.data.train, self.data.val
+        settings: dict[str, Any] = {
+            "model": {key: recipe["model"][key] for key in PART_OF[name].sizes},
+            "training": {key: recipe["training"][key] for key in training_keys},
+            "scans": {"train": digest_of_scans(train), "val": digest_of_scans(val)},
+            "init": self.init.digest(part) if self.init and part in self.init.parts else None,
+            "classes": self.data.digest_of_classes(),
+        }
+
+        if self.scores is not None:
+            settings["scores"] = self.scores.digests([*train, *val])
+        elif name == "head":
+            settings["networks"] = {network: weights.digest(network) for network in BOTH_NETWORKS}
+        return settings
+
+    def stage_record(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the record of a stage's training by some `settings`; its weights store it."""
+        scores = {"scores": settings["scores"]} if "scores" in settings else {}
+        return {
+            **settings["training"],
+            "sequences": sequence_names(self.data.train),
+            "validated_on": sequence_names(self.data.val),
+            "scans": len(self.data),
+            **scores,
+        }
+
+    def record(self) -> dict[str, Any]:
+        """Return the inputs of the run, for the record of its folder."""
+        specs = self.data.specs
+        record: dict[str, Any] = {
+            "versions": {name: version(name) for name in PACKAGES},
+            "python": platform.python_version(),
+            "data": specs if len(specs) > 1 else specs[0],
+            "classes": self.data.taxonomy.name,
+            "train": sequence_names(self.data.train),
+            "val": sequence_names(self.data.val),
+            "init": None if self.init is None else self.init.digests(),
+        }
+        if self.scores is not None:
+            record["scores"] = repr(self.scores)
+        return record
 
     @classmethod
     def open(
@@ -192,10 +269,10 @@ def without_initial_weights(
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
 
-    networks = {}
-    changed = []
-    for name in ("rv", "bev"):
-        config = getattr(recipe.training, name)
+    networks: dict[str, Any] = {}
+    changed: list[str] = []
+    for name in NETWORK_STAGES:
+        config = recipe.training.of(name)
         if name in stages and (config.initial or config.distill):
             changed.append(name)
         networks[name] = dataclasses.replace(config, initial=0.0, distill=0.0)
@@ -215,7 +292,7 @@ def open_for_training(
     out: Path,
     init: Weights | None = None,
     *,
-    stages: Sequence[str] = (),
+    stages: Sequence[StageName] = (),
     report: Reporter = report_nothing,
 ) -> Dataset:
     """Open the dataset of a training.
@@ -227,10 +304,10 @@ def open_for_training(
     Raises:
         InputError: if the dataset cannot be opened (`open_dataset`).
     """
-    begun = _earlier(out) if init is None else [init]
+    begun = RunFolder(out).networks() if init is None else [init]
     known = begun[-1].expects if begun else Expectation.of_sensor(recipe.sensor)
     parts = {part for weights in begun for part in weights.parts}
-    expected = expected_before(known, parts, recipe, stages)
+    expected = with_options(known, parts, recipe, stages)
 
     opened = normalised(open_dataset(data), Normaliser(expected, report=report))
     if isinstance(opened.normalise, Normaliser):
@@ -251,13 +328,3 @@ def _report_recordings(dataset: Dataset, normaliser: Normaliser, report: Reporte
     rest = f"; {counted(more, 'further recording')} not shown" if more > 0 else ""
     report(f"{dataset.spec}: if an assumption is wrong, state the right value under sensor{rest}")
     normaliser.quiet()
-
-
-def _earlier(out: Path) -> list[Weights]:
-    """Return the weights of the networks that earlier calls have written into a folder."""
-    paths = [out / name / "last.safetensors" for name in NETWORK_OF]
-    paths = [path for path in paths if path.is_file()]
-    whole = out / "weights.safetensors"
-    if not paths and whole.is_file():  # the networks of --init
-        paths = [whole]
-    return [read(path) for path in paths]

@@ -11,6 +11,7 @@ import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
+from amvnet.config.schema import HeadTraining, NetworkTraining, StageName, TrainingConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
@@ -42,7 +43,6 @@ from amvnet.runtime.memory import keep_freed_memory
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
 from amvnet.training.curves import EPOCHS
 from amvnet.training.plan import Plan
-from amvnet.training.run_folder import LAST, is_finished
 from amvnet.training.sync_batch_norm import synchronise_batch_norms
 from amvnet.weights.file import Weights
 
@@ -60,33 +60,53 @@ HALF: Final = "16-mixed"
 Loaders = tuple[DataLoader[Any], DataLoader[Any] | None]
 
 
-class Stage(L.LightningModule):
-    """The base class of all stages: it computes the metrics of the validation, and the schedule.
+@dataclass(frozen=True)
+class StageContext:
+    """What a stage takes from its run.
 
-    `config` has the values of the stage in the recipe. The forward and backward passes compute in
-    `precision`.
+    Attributes:
+        config: the values of the stage in the recipe.
+        device: what the stage is trained on: "cpu", "cuda", ...
+        precision: the precision of the forward and backward passes.
     """
 
-    name: str  # the value of --stage
+    config: NetworkTraining | HeadTraining
+    taxonomy: Taxonomy
+    processes: Processes = ALONE
+    report: Reporter = report_nothing
+    device: str = "cpu"
+    precision: Precision = SINGLE
+
+    @classmethod
+    def of(cls, plan: Plan, name: StageName) -> StageContext:
+        """Return what a stage takes from a run. The head always computes in float32.
+
+        It is so small that a lower precision would save nothing.
+        """
+        training = plan.recipe.training
+        device = device_of(training.accelerator)
+        precision = SINGLE if name == "head" else precision_of(training, device)
+        config = training.of(name)
+        return cls(config, plan.data.taxonomy, plan.processes, plan.report, device, precision)
+
+
+class Stage(L.LightningModule):
+    """The base class of all stages: it computes the metrics of the validation, and the schedule."""
+
+    name: StageName
     trained: nn.Module  # the part of the model that this stage trains
 
     # The mIoU that chooses the best weights, if `val/miou` does not depend on the trained part.
     own_miou: float | None = None
 
-    def __init__(
-        self,
-        config: NetworkTraining | HeadTraining,
-        taxonomy: Taxonomy,
-        processes: Processes = ALONE,
-        report: Reporter = report_nothing,
-        precision: Precision = SINGLE,
-    ) -> None:
+    def __init__(self, context: StageContext) -> None:
         super().__init__()
-        self.config = config
-        self.taxonomy = taxonomy
-        self.processes = processes
-        self.report = report
-        self.precision = precision
+        self.context = context
+        self.config = context.config
+        self.taxonomy = context.taxonomy
+        self.processes = context.processes
+        self.report = context.report
+        self.precision = context.precision
         self.matrix = self.empty_matrix()
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
@@ -223,7 +243,7 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, weights: Weights) -> None:
 
     stage.train()
     train, val = loaders
-    device = device_of(plan.recipe.training.accelerator)
+    device = stage.context.device
     if device == "cpu":
         keep_freed_memory()
     if plan.processes.size > 1:
@@ -231,9 +251,8 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, weights: Weights) -> None:
     if stage.precision == DOUBLE:
         stage.double()
 
-    folder = plan.out / stage.name
-    checkpoint = folder / LAST
-    begun = checkpoint if plan.resume and checkpoint.is_file() else None
+    folder = plan.folder.stages[stage.name]
+    begun = folder.checkpoint if plan.resume and folder.checkpoint.is_file() else None
     if begun is not None:
         # Lightning sets the sampler's epoch only after the reading processes have begun to draw.
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
@@ -255,8 +274,8 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, weights: Weights) -> None:
         accumulate_grad_batches=getattr(stage.config, "accumulate", 1),
         gradient_clip_val=getattr(stage.config, "clip", None),
         callbacks=_callbacks(stage, plan, KeepWeights(plan, stage.name, weights)),
-        default_root_dir=folder,
-        logger=TensorBoardLogger(folder, name="", version=""),
+        default_root_dir=folder.path,
+        logger=TensorBoardLogger(folder.path, name="", version=""),
         enable_progress_bar=plan.bars and plan.processes.first,
         enable_model_summary=False,
         log_every_n_steps=min(LOGGED_EVERY, len(train)),
@@ -313,24 +332,21 @@ def _epochs_after(stage: Stage, plan: Plan) -> int:
     """
     epochs = 0
     for name in plan.stages[plan.stages.index(stage.name) + 1 :]:
-        config = getattr(plan.recipe.training, name)
-        if not (plan.resume and is_finished(plan, name)):
+        config = plan.recipe.training.of(name)
+        if not (plan.resume and plan.folder.stages[name].is_finished):
             epochs += max(config.views, 1) if isinstance(config, HeadTraining) else config.epochs
     return epochs
 
 
-def precision_of(training: TrainingConfig) -> Precision:
-    """Return the precision of a training, as Lightning names it.
+def precision_of(training: TrainingConfig, device: str) -> Precision:
+    """Return the precision of a training on a device, as Lightning names it.
 
     `auto` is bf16-mixed on a device with bfloat16 arithmetic, and 32-true on others. They only
     emulate bfloat16, which takes several times as long.
-
-    Raises:
-        InputError: if this machine does not have the training's accelerator.
     """
     if training.precision != "auto":
         return training.precision
-    return MIXED if _multiplies_bfloat16(device_of(training.accelerator)) else SINGLE
+    return MIXED if _multiplies_bfloat16(device) else SINGLE
 
 
 def _multiplies_bfloat16(device: str) -> bool:

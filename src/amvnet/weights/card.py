@@ -11,14 +11,11 @@ from itertools import islice
 import yaml
 
 from amvnet.config.nested import flat
+from amvnet.config.parts import PART_OF
 from amvnet.models.methods import widest_method
 from amvnet.weights.file import Weights
 
-TITLES = {
-    "range_net": "Range-view network",
-    "polar_net": "Bird's-eye-view network",
-    "point_head": "Point head",
-}
+TITLES = {part.name: part.title for part in PART_OF.values()}
 # The columns of the table of metrics: their titles, by the key of the validation metric.
 METRICS = {"val/miou": "mIoU", "val/miou_present": "mIoU, classes present", "val/acc": "accuracy"}
 MAX_SETTINGS = 100  # largest number of settings that the card lists of a part's training

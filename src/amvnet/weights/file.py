@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import errno
-import hashlib
 import json
 from collections.abc import Mapping
 from contextlib import suppress
@@ -21,16 +20,16 @@ from torch import Tensor
 
 from amvnet.config.bounds import check_text
 from amvnet.config.nested import from_dict, to_dict
+from amvnet.config.parts import PARTS
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, did_you_mean, reason_of, shown
-from amvnet.files import atomic_write
+from amvnet.files import atomic_write, digest
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
 from amvnet.sensors.expectation import Expectation
 from amvnet.weights import hub
 
-PARTS = ("range_net", "polar_net", "point_head")  # parts of the method, as `AMVNet` names them
 UNCERTAIN = "val/uncertain"  # metric of the point head: the share of uncertain points
 MIOU = "val/miou_present"  # metric of each part: the mIoU of the classes that it was validated on
 # A validation with a smaller mIoU, or a larger share of uncertain points, says that the weights
@@ -135,11 +134,10 @@ class Weights:
 
     def digest(self, name: str) -> str:
         """Return 16 hexadecimal digits that identify the parameters of one part."""
-        digest = hashlib.sha256()
-        for key, tensor in sorted(self.part(name).items()):
-            digest.update(key.encode() + tensor.cpu().contiguous().numpy().tobytes())
-
-        return digest.hexdigest()[:16]
+        parameters = sorted(self.part(name).items())
+        return digest(
+            key.encode() + tensor.cpu().contiguous().numpy().tobytes() for key, tensor in parameters
+        )
 
     def digests(self) -> dict[str, str]:
         """Return the digest of each part."""

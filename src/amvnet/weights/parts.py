@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from amvnet.config.nested import flat, to_dict
+from amvnet.config.parts import PART_OF
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
@@ -17,11 +18,7 @@ from amvnet.models.point_head import PointHead
 from amvnet.weights.file import Weights
 
 # The fields of `ModelConfig` that set the sizes of each part.
-SIZES = {
-    "range_net": ("range_view", "range_net"),
-    "polar_net": ("polar_view", "polar_net"),
-    "point_head": ("assertion", "point_head"),
-}
+SIZES = {part.name: part.sizes for part in PART_OF.values()}
 
 
 def replace_part(weights: Weights, part: str, other: Weights) -> Weights:

@@ -84,9 +84,9 @@ def add_lot(area: Plot, depth: float) -> None:
             yaw = angle + np.pi * (rng.random() < 0.5) + rng.normal(scale=0.03)
             if rng.random() < 0.07:
                 tree = trees.random_tree(rng, rng.uniform(3, 7))
-                area.put(tree, x, distance, margin=-np.inf)
+                area.put(tree, x, distance, margin=None)
             elif rng.random() < taken and length_of(mesh) < 6.5:
-                area.put(mesh, x, distance, yaw, thing=True, margin=-np.inf)
+                area.put(mesh, x, distance, yaw, thing=True, margin=None)
     _put_people(area, depth, 1.0)
 
 
@@ -119,14 +119,14 @@ def _put_large(area: Plot, x: float, distance: float, heading: float) -> float:
     if rng.random() < 0.15:
         size = (rng.uniform(3, 6.1), 2.4, rng.uniform(1.2, 2.6))
         container = part([box(size)], Surface.COATING, Label.OTHER_OBJECT)
-        area.put(container, x + size[0] / 2, distance, yaw, margin=-np.inf)
+        area.put(container, x + size[0] / 2, distance, yaw, margin=None)
         return size[0]
 
     has_trailer = rng.random() < 0.12
     bodies = car_with_trailer(rng) if has_trailer else [choose_vehicle(area.site, "yard")(rng)]
     length = sum(length_of(body) for body in bodies)
     for body in bodies:
-        area.put(body, x + length / 2, distance, yaw, thing=True, margin=-np.inf)
+        area.put(body, x + length / 2, distance, yaw, thing=True, margin=None)
     return length
 
 
@@ -146,11 +146,11 @@ def add_square(area: Plot, depth: float) -> None:
     for _ in range(rng.poisson(2)):
         distance = front + rng.uniform(1, depth)
         tree = trees.random_tree(rng, rng.uniform(4, 9))
-        area.put(tree, rng.uniform(area.x, area.end), distance, margin=-np.inf)
+        area.put(tree, rng.uniform(area.x, area.end), distance, margin=None)
     for _ in range(rng.poisson(3)):
         distance = front + rng.uniform(1, depth)
         thing = clutter.clutter(rng)
-        area.put(thing, rng.uniform(area.x, area.end), distance, margin=-np.inf)
+        area.put(thing, rng.uniform(area.x, area.end), distance, margin=None)
     _put_people(area, depth, 4.0)
 
 
@@ -163,4 +163,4 @@ def _put_people(area: Plot, depth: float, mean: float) -> None:
         group = people.people_group(rng) if rng.random() < 0.3 else [people.person(rng)]
         yaw = rng.uniform(0, 2 * np.pi)
         for person in group:
-            area.put(person, x, distance, yaw, thing=True, margin=-np.inf)
+            area.put(person, x, distance, yaw, thing=True, margin=None)

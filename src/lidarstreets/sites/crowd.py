@@ -63,15 +63,15 @@ def _add_occasion(site: Site, occasion: str, side: int, x: float) -> None:
         for index in range(int(rng.choice([1, 1, 1, 2, 3]))):
             site.put_moving(people.person(rng), x + 0.3 * index, t + 0.6 * index, speed)
     elif occasion == "stand":
-        site.put(people.person(rng), x, t, turn, thing=True, margin=-np.inf)
+        site.put(people.person(rng), x, t, turn, thing=True, margin=None)
     elif occasion == "meet":
         for person in people.people_group(rng):
-            site.put(person, x, t, turn, thing=True, margin=-np.inf)
+            site.put(person, x, t, turn, thing=True, margin=None)
     elif occasion == "cross":
         walker = people.person(rng)
         across = rng.uniform(-1, 1) * style.road / 2
         yaw = side * np.pi / 2 + rng.normal(scale=0.4)
-        site.put(walker, x, across, yaw, thing=True, margin=-np.inf)
+        site.put(walker, x, across, yaw, thing=True, margin=None)
     elif occasion == "sit":
         bench_t = side * (front + rng.uniform(-0.3, 0.6))
         facing = -side * np.pi / 2
@@ -82,7 +82,7 @@ def _add_occasion(site: Site, occasion: str, side: int, x: float) -> None:
             site.put(people.sitter(rng), x + offset, bench_t, facing, thing=True)
     else:  # stand by a car
         door_t = side * (style.road / 2 - 0.3 + rng.uniform(0.0, 0.8))
-        site.put(people.person(rng), x, door_t, turn, thing=True, margin=-np.inf)
+        site.put(people.person(rng), x, door_t, turn, thing=True, margin=None)
 
 
 def park_two_wheelers(site: Site) -> None:

@@ -112,7 +112,7 @@ def fill_islands(site: Site) -> None:
             continue
         if not style.has_long_median:
             for x in (start + 0.7, stop - 0.7):
-                site.put(furniture.sign(rng), x, middle, along_road(-1), margin=-np.inf)
+                site.put(furniture.sign(rng), x, middle, along_road(-1), margin=None)
             continue
 
         for x in np.arange(start + 3, stop - 3, rng.uniform(7, 16)):
@@ -138,10 +138,10 @@ def _put_barriers(site: Site, x: tuple[float, float], t: float, kind: str) -> No
     concrete = furniture.barrier(BARRIER_STEP + CONCRETE_OVERLAP)
     for middle in np.arange(x[0], x[1], BARRIER_STEP):
         if kind == "rail":
-            site.put(rail, middle, t + 0.3, margin=-np.inf)
-            site.put(rail, middle, t - 0.3, np.pi, margin=-np.inf)
+            site.put(rail, middle, t + 0.3, margin=None)
+            site.put(rail, middle, t - 0.3, np.pi, margin=None)
         else:
-            site.put(concrete, middle, t, margin=-np.inf)
+            site.put(concrete, middle, t, margin=None)
 
 
 def _fill_roundabout(site: Site, roundabout: Roundabout) -> None:

@@ -58,7 +58,8 @@ class Site:
     Attributes:
         ground: the street.
         rng: draws everything in the street.
-        course: (P, 2) x and y of the sensor at each of P scans, metres; no body covers them.
+        course: (P, 2) x and y of the sensor at each of P scans, metres; no body covers them. It is
+            None until it is drawn, and then no body can be put.
         fixed: bodies that stand still.
         movers: bodies that move.
         instances: number of instance ids in use.
@@ -66,17 +67,17 @@ class Site:
 
     ground: Ground
     rng: np.random.Generator
-    course: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    course: np.ndarray | None = None
     fixed: list[Mesh] = field(default_factory=list)
     movers: list[Mover] = field(default_factory=list)
     instances: int = 0
 
-    def is_free(self, x: float, t: float, margin: float) -> bool:
+    def is_free(self, x: float, t: float, margin: float | None) -> bool:
         """Return whether a place x, t is farther than `margin` metres from what must stay free.
 
-        Side roads and reserved stretches of the street must stay free.
+        Side roads and reserved stretches of the street must stay free, unless `margin` is None.
         """
-        if margin == -np.inf:
+        if margin is None:
             return True
         for side, start, stop in self.ground.reserved:
             if t * side > 0 and start - margin < x < stop + margin:
@@ -94,7 +95,7 @@ class Site:
         yaw: float = 0.0,
         *,
         thing: bool = False,
-        margin: float = 0.8,
+        margin: float | None = 0.8,
     ) -> None:
         """Put a body at street coordinates, unless the place is not free.
 
@@ -115,7 +116,12 @@ class Site:
         """Put a body on the ground at x, y, unless it would cover the course of the sensor.
 
         The yaw is in the frame of the street's mesh, in radians. A `thing` gets an instance id.
+
+        Raises:
+            ValueError: if the course is not drawn yet.
         """
+        if self.course is None:
+            raise ValueError("expected the course of the sensor before any body, found none")
         if covers(mesh, (x, y, yaw), self.course, CLEARANCE):
             return
 
@@ -195,13 +201,13 @@ class Plot:
         yaw: float = 0.0,
         *,
         thing: bool = False,
-        margin: float = 0.8,
+        margin: float | None = 0.8,
     ) -> None:
         """Put a body `distance` metres from the middle line of the street; see `Site.put`."""
         self.site.put(mesh, x, self.side * distance, yaw, thing=thing, margin=margin)
 
     def put_piece(
-        self, mesh: Mesh, x: float, distance: float, yaw: float = 0.0, margin: float = 0.8
+        self, mesh: Mesh, x: float, distance: float, yaw: float = 0.0, margin: float | None = 0.8
     ) -> None:
         """Put a piece of a larger body; see `put`. Its tint stays like the tint of other pieces."""
         t = self.side * distance

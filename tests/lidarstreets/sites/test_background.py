@@ -31,7 +31,7 @@ def test_side_roads_have_all_layers_of_a_boundary(monkeypatch: pytest.MonkeyPatc
     heights = []
     for _ in range(6):
         ground = Ground(draw_style(rng, Region()), 120.0, rng, (40.0, 80.0))
-        site = Site(ground, rng)
+        site = Site(ground, rng, course=np.zeros((0, 2)))
         for road in ground.plan.crossings:
             for side in (-1, 1):
                 line_side_road(site, road, side)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -165,12 +164,11 @@ def show_evaluation(
         tau: the threshold of the assertion if the user chose it.
     """
     from amvnet.cli.tables import evaluation_table
-    from amvnet.files import atomic_write
+    from amvnet.files import write_json
 
     figures = evaluation.report(dataset)
     if tau is not None:
         figures["tau"] = tau
     show(evaluation_table(figures, evaluation.taxonomy))
     if path is not None:
-        with atomic_write(path) as part:
-            part.write_text(json_format.dumps(figures, indent=1))
+        write_json(path, figures)

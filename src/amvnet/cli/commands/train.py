@@ -50,16 +50,16 @@ def train(
         with_val: also train on the validation scans, and skip the validation, as for an entry to a
             benchmark.
     """
-    from amvnet.models.methods import BOTH_NETWORKS
+    from amvnet.config.parts import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
     from amvnet.training.plan import Plan
     from amvnet.training.run import train as train_stages
-    from amvnet.training.run_folder import check_new
+    from amvnet.training.run_folder import RunFolder
     from amvnet.weights.file import load
 
     if not resume:
         for name in recipe.stages if stage == "all" else (stage,):
-            check_new(out / name)  # before the scans are measured
+            RunFolder(out).stages[name].check_begun()  # before the scans are measured
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     plan = Plan.open(
         recipe,

@@ -16,6 +16,7 @@ from amvnet.data.datasets.simulated import SCANS
 from amvnet.data.formats.find import scan_stem
 from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
+from amvnet.files import digest
 from amvnet.scan import Scan
 
 SEED = 16  # seed of the order in which the scans of a mixed dataset take their turns
@@ -161,6 +162,14 @@ class TrainingData:
                 records.append(record)
         return records
 
+    def digest_of_classes(self) -> str:
+        """Return a digest of the classes' names in order, and of their raw ids in each dataset."""
+        classes = []
+        for source in self.sources:
+            taxonomy = source.dataset.taxonomy
+            classes.append((taxonomy.classes, sorted(taxonomy.raw_to_train.items(), key=str)))
+        return digest(repr(classes))
+
     def in_epoch(self, number: int, epoch: int = 0) -> list[ScanRecord]:
         """Return the scans of a source in an epoch, in the order of their places."""
         return [self._turn(number, place, epoch) for place in range(self.places[number])]
@@ -188,6 +197,20 @@ class TrainingData:
         if number > 0:
             turn = _order(number, len(source.train))[turn]
         return source.dataset.at_epoch(source.train[turn], epoch)
+
+
+def digest_of_scans(records: Sequence[ScanRecord]) -> str:
+    """Return a digest of the names of some scans and the sizes of their files."""
+    sizes = []
+    for record in records:
+        path = record.points_path
+        sizes.append((record.name, path.stat().st_size if path.is_file() else None))
+    return digest(repr(sizes))
+
+
+def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
+    """Return the sorted names of the sequences of some scans, each once."""
+    return sorted({record.sequence for record in records})
 
 
 def _identity(record: ScanRecord) -> tuple[str, str]:

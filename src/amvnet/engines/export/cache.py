@@ -5,7 +5,6 @@ Its files can be made again, and no other user may write them.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import stat
@@ -23,7 +22,7 @@ from amvnet.engines.export.onnx import OPSET, check_libraries, export
 from amvnet.engines.export.onnx_files import IR_VERSION
 from amvnet.engines.onnx import RANGE_NET, UNET, ExportedNetworks
 from amvnet.errors import InputError
-from amvnet.files import make_folder, temporary_folder, unfinished
+from amvnet.files import digest, make_folder, temporary_folder, unfinished
 from amvnet.models.methods import widest_method
 from amvnet.onnx_runner import read_description, read_graph
 from amvnet.progress import Reporter, report_nothing
@@ -84,7 +83,7 @@ def _key(weights: Weights, int8: bool) -> str:
     key = [*digests, repr(weights.model), version("amvnet"), torch.__version__]
     if int8:
         key.append(f"int8 {SIMULATED}")
-    return hashlib.sha256(repr((key, OPSET, IR_VERSION)).encode()).hexdigest()[:16]
+    return digest(repr((key, OPSET, IR_VERSION)))
 
 
 def _read(folder: Path, weights: Weights) -> dict[str, bytes]:

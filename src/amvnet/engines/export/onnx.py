@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -19,7 +18,7 @@ from amvnet.engines.base import build_model
 from amvnet.engines.export.int8 import KEEPS_FIRST_LAYER, quantise
 from amvnet.engines.export.onnx_files import digest, finish, quiet
 from amvnet.errors import InputError, import_optional
-from amvnet.files import atomic_write, publish, temporary_folder
+from amvnet.files import atomic_write, publish, temporary_folder, write_json
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName, check_method, widest_method
 from amvnet.models.point_head import head_features, point_table
@@ -116,7 +115,7 @@ def export(
             publish(temporary / f"{name}.onnx", out / f"{name}.onnx")
 
     with atomic_write(out / DESCRIPTION) as file:
-        _save(description, file)
+        write_json(file, description)
     return graphs
 
 
@@ -140,7 +139,7 @@ def _write_all(
             written[name] = _write(graph, name, folder / f"{name}.onnx")
 
     description = describe_export(weights, method, written)
-    _save(description, folder / DESCRIPTION)  # the calibration reads it to run the graphs
+    write_json(folder / DESCRIPTION, description)  # the calibration reads it to run the graphs
     progress(len(graphs), total)
 
     for count, (name, changes) in enumerate(quantise(folder, convolutions, scans), len(graphs) + 1):
@@ -148,10 +147,6 @@ def _write_all(
         written[name] |= changes
         progress(count, total)
     return description
-
-
-def _save(description: dict[str, Any], path: Path) -> None:
-    path.write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
 
 
 def check_libraries() -> None:
