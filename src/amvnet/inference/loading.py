@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from amvnet.config.parts import PARTS
 from amvnet.data.formats.rows import parse_layout
 from amvnet.engines.base import Engine
 from amvnet.engines.compute import Compute, EngineName, Precision
@@ -19,7 +20,7 @@ from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method
 from amvnet.progress import Reporter, report_nothing
 from amvnet.sensors.lidars import AUTO, make_sensor
-from amvnet.weights.file import PARTS, Weights
+from amvnet.weights.file import Weights
 from amvnet.weights.file import load as load_weights
 
 

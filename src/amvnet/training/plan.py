@@ -54,7 +54,7 @@ class Plan:
         also_read: files besides the scans that the run reads. Entries that name no file are
             ignored.
         expects: what the networks expect of a scan, and the weights will say. By default, the
-            training measures it on its scans before the first stage (`expected_after`).
+            training measures it on its scans before the first stage (`expectation_of`).
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, the recipe is for other
