@@ -42,7 +42,7 @@ from safetensors import safe_open
 
 import amvnet
 from amvnet.cli.main import COMMANDS, WITH_RECIPE
-from amvnet.cli.options import FormatName
+from amvnet.cli.options import FormatName  # type: ignore[attr-defined]  # as in earlier commits
 from amvnet.config.recipes import recipe_names
 from amvnet.models.methods import MethodName
 from amvnet.weights.file import built_in

@@ -12,9 +12,12 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from amvnet.errors import InputError
 
+# The format of the labels of a scan file.
+FormatName = Literal["label", "npy", "ply", "pcd", "las", "laz"]
 HEAD = 4096  # length of the beginning of a file that is compared with a signature, bytes
 
 

@@ -159,10 +159,13 @@ def test_an_interrupted_run_resumes_to_the_same_labels(
 
 
 @pytest.mark.full
-def test_a_run_is_not_resumed_with_other_poses(world: Path, tmp_path: Path) -> None:
+def test_a_run_is_not_resumed_with_other_poses_or_past_scans_alone(
+    world: Path, tmp_path: Path
+) -> None:
     np.save(tmp_path / "poses.npy", POSES)
     out = tmp_path / "out"
     succeed(predict(world, out, f"--poses {tmp_path}/poses.npy"))
+    refused(predict(world, out, f"--resume --past-only --poses {tmp_path}/poses.npy"), "drive")
     np.save(tmp_path / "poses.npy", np.linalg.inv(POSES[2]) @ POSES)
     refused(predict(world, out, f"--resume --poses {tmp_path}/poses.npy"), "drive")
     command = f"predict {world}/data --weights {world}/w.safetensors --out {out} --resume"

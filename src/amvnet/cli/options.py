@@ -13,6 +13,7 @@ from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError, listed
 from amvnet.models.methods import MethodName
+from amvnet.outputs import FormatName
 from amvnet.progress import counted
 from amvnet.sensors.lidars import AUTO, Sensor
 
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
 
 # Only nuScenes has the last two splits.
 SplitName = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
-
-# The format of label files for scan files.
-FormatName = Literal["label", "npy", "ply", "pcd", "las", "laz"]
 
 UNKNOWN = Sensor()
 MAX_SEQUENCES = 20  # largest number of sequences that a line names

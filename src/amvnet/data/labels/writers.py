@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -15,10 +15,9 @@ from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.outputs import Signature
+from amvnet.outputs import FormatName, Signature
 
-Kind = Literal["label", "npy", "ply", "pcd", "las", "laz"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+KINDS = get_args(FormatName)
 
 # The largest rounding error of coordinates in float32, metres; if it is larger, they are float64.
 MAX_ERROR = 0.0005
