@@ -17,7 +17,13 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs/results.json"
-PAGES = ("README.md", "docs/index.md", "docs/log.md", "docs/evaluation.md", "docs/finetuning.md")
+PAGES = (
+    "README.md",
+    "docs/results.md",
+    "docs/log.md",
+    "docs/evaluation.md",
+    "docs/finetuning.md",
+)
 PRINTED_METHODS = ("rv", "bev", "ensemble", "amvnet", "drive")
 # The seven classes of the map `lidog`, in its order.
 SEVEN = ("vehicle", "person", "road", "sidewalk", "terrain", "man-made", "vegetation")

@@ -51,9 +51,21 @@ def test_the_first_screen_of_the_readme_needs_no_word_of_the_method() -> None:
     screen = "\n".join(readme.splitlines()[:60])
     words = r"RV|BEV|ensembles?|range|bird|heads?|tau|fus\w+|projections?|mIoU|IoU|\d{4}-\d\d"
     assert re.findall(rf"\b({words})\b", screen) == []
-    for command in ("git clone", "make demo", "make test"):
+    for command in (
+        "git clone",
+        "make install",
+        "amvnet predict scan.bin",
+        "make demo",
+        "make test",
+    ):
         assert re.search(rf"(?m)^{command}\b", screen)
+    assert "source .venv/bin/activate" in screen
+    assert screen.index("docs/figures/viewer.webp") < screen.index("git clone")
     assert "http://localhost:8000/try/" in screen
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().split()) <= 1100
 
 
 def test_the_page_in_the_browser_has_less_than_1700_lines_of_code() -> None:
