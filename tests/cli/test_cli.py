@@ -103,7 +103,6 @@ MISTAKES = {
     "init of other classes": TRAIN_RV + " --init {w}/nuscenes.safetensors",
     "init of other classes for the head": TRAIN_HEAD + " --init {w}/nuscenes.safetensors",
     "recipe of other classes": "train nuscenes-compact --data {w}/data --out {out}",
-    "weights without head": "predict {w}/data --weights {w}/headless.safetensors --out {out}",
     "missing sequence": ("predict {w}/data --weights {w}/w.safetensors --out {out} --sequences 05"),
     "missing sequence to score": EVALUATE + " --sequences 05 --json {out}/m.json",
     "missing sequence to learn": TRAIN + " --train-sequences 05 --val-sequences 08",

@@ -14,9 +14,9 @@ from torch import nn
 
 from amvnet.config.schema import HeadTraining, NetworkTraining, Recipe, TrainingConfig
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
-from amvnet.training.run_folder import DONE, RunFolder, StageFolder
+from amvnet.training.run_folder import RunFolder, StageFolder
 from amvnet.training.stage import _epochs_after
-from amvnet.weights.file import load
+from amvnet.weights.file import DONE, load
 
 from fixtures.tiny import fresh_weights
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import pytest
 import yaml
 
 from amvnet.config.schema import Recipe
@@ -14,15 +15,23 @@ from amvnet.training.plan import Plan
 from amvnet.training.run_folder import (
     LAST,
     MAX_CHANGES,
-    SETTINGS,
     RunFolder,
     StageFolder,
     describe_changes,
 )
+from amvnet.weights.file import (
+    DONE,
+    RECORD,
+    RUN_WEIGHTS,
+    SETTINGS,
+    load,
+    save,
+    unfinished_stages,
+)
 
-from fixtures.commands import fails
+from fixtures.commands import fails, refused, succeed
 from fixtures.datasets import make_semantickitti
-from fixtures.tiny import fresh_weights
+from fixtures.tiny import fresh_weights, without
 
 EARLIER = {
     "model": {"range_net": {"widths": [8, 16], "gru": True}},
@@ -93,3 +102,35 @@ def test_a_refused_resume_says_which_values_differ(tmp_path: Path) -> None:
     (tmp_path / SETTINGS).unlink()
     many = {**EARLIER, "model": {str(index): index for index in range(2 * MAX_CHANGES)}}
     fails(lambda: folder.check_begun(many), "and ", " more")
+
+
+def test_weights_of_a_run_that_was_stopped_say_so(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    (run / "rv").mkdir(parents=True)
+    (run / "rv" / SETTINGS).touch()
+    (run / RECORD).touch()
+    command = f"evaluate {world}/data --split all --weights {run}"
+    refused(command, "not finished a stage", "--resume")
+
+    (run / "rv" / DONE).touch()
+    (run / "bev").mkdir()
+    (run / "bev" / SETTINGS).touch()
+    assert unfinished_stages(run) == ["bev"]
+    save(without(load(world / "w.safetensors"), "polar_net", "point_head"), run / RUN_WEIGHTS)
+    succeed(command)
+    assert f"{run} is a run that has not finished bev" in capsys.readouterr().out
+    (run / "bev" / DONE).touch()
+    succeed(f"{command} --split train")
+    assert "not finished" not in capsys.readouterr().out
+
+
+def test_weights_without_a_head_label_by_the_ensemble_and_say_so(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = f"predict {world}/lone.bin --weights {world}/headless.safetensors --out {tmp_path}"
+    succeed(f"{command}/a")
+    assert "the method is ensemble, not amvnet" in capsys.readouterr().out
+    succeed(f"{command}/b --method ensemble")
+    assert (tmp_path / "a/lone.label").read_bytes() == (tmp_path / "b/lone.label").read_bytes()

@@ -12,7 +12,7 @@ from amvnet.cli.parser import flag_of
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError, listed
-from amvnet.models.methods import MethodName
+from amvnet.models.methods import MethodName, widest_method
 from amvnet.outputs import FormatName
 from amvnet.progress import counted
 from amvnet.sensors.lidars import AUTO, Sensor
@@ -132,7 +132,7 @@ class TrainingChoice:
         from amvnet.data.datasets.training_data import Source
 
         train, val = named_sequences(dataset, self.train_sequences, self.val_sequences)
-        _report_unnamed(Source.labelled(dataset, train, val))
+        _report_split(Source.labelled(dataset, train, val))
         splits = {"train": dataset.records(train), "val": dataset.records(val)}
         test = dataset.having_labels(dataset.records(dataset.split().part("test")))
         if test:
@@ -144,12 +144,14 @@ def report_unused(source: Source, title: str = "") -> None:
     """Report the scans that a training does not use, in lines that begin with `title`."""
     if source.unlabelled:
         report(f"{title}skipped for lack of labels: {describe_records(source.unlabelled)}")
-    _report_unnamed(source, title)
+    _report_split(source, title)
 
 
-def _report_unnamed(source: Source, title: str = "") -> None:
-    """Report the scans of a dataset that its split does not name."""
+def _report_split(source: Source, title: str = "") -> None:
+    """Report the scans of a dataset that its split does not name, or a split that nobody named."""
     split = source.dataset.split()
+    if split.note and {record.sequence for record in source.val} == set(split.part("val")):
+        report(f"{title}{split.note}")
     rest = source.dataset.records(split.part("rest") if split.is_given else ())
     used = {record.name for record in (*source.train, *source.val)}
     unnamed = [record for record in rest if record.name not in used]
@@ -226,7 +228,7 @@ class LabelChoice:
 
         return LabellingRequest(
             weights,
-            self.method,
+            method_for(weights, self.method),
             self.tau,
             precision=compute.precision,
             engine=compute.engine,
@@ -329,12 +331,19 @@ def load_for(
     Raises:
         InputError: if there are no such weights.
     """
-    from amvnet.weights.file import load
+    from amvnet.weights.file import load, unfinished_stages
 
     if weights == AUTO:
         weights, reason = inputs.choose_weights(sensor)
         report(f"weights {weights}, {reason}{then}")
-    return weights, load(weights)
+    loaded = load(weights)
+    stages = unfinished_stages(weights)
+    if stages:
+        report(
+            f"warning: {weights} is a run that has not finished {' and '.join(stages)}: these are "
+            f"the weights of its other stages; amvnet train ... --resume goes on"
+        )
+    return weights, loaded
 
 
 def load_dataset(
@@ -358,6 +367,15 @@ def load_dataset(
     if mapping is None:
         dataset = with_classes(dataset, loaded.taxonomy)
     return name, loaded, normalised(dataset, Normaliser(loaded.expects))
+
+
+def method_for(weights: Weights, method: MethodName = "amvnet") -> MethodName:
+    """Return the method, or a part of AMVNet if the weights have no more; a line then says so."""
+    widest = widest_method(weights.parts)
+    if method != "amvnet" or widest == "amvnet":
+        return method
+    report(f"the weights have only {', '.join(weights.parts)}: the method is {widest}, not amvnet")
+    return widest
 
 
 def load_segmenter(

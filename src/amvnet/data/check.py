@@ -68,7 +68,8 @@ class SplitReport:
         points: (K + 1,) the number of points by train id.
         scans_with: (K + 1,) the number of scans with a point of each train id.
         scans: the names of the labelled scans that could be read.
-        unlabelled: the names of the scans without a label file, which are skipped.
+        unlabelled: the names of the scans without a label file, which are skipped, and the path
+            of the file that each lacks ("" if the dataset has no place for it).
         neighbours, raised: the sums of those in `Contents`.
         stray: the names of the scans whose labels do not follow the geometry.
     """
@@ -78,7 +79,7 @@ class SplitReport:
     neighbours: np.ndarray
     raised: np.ndarray
     scans: list[str] = field(default_factory=list)
-    unlabelled: list[str] = field(default_factory=list)
+    unlabelled: dict[str, str] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)
     unknown: dict[int, UnknownId] = field(default_factory=dict)
     stray: list[str] = field(default_factory=list)
@@ -203,9 +204,10 @@ class Report:
         for name, split in self.splits.items():
             if split.unlabelled:
                 total = len(split.unlabelled) + len(split.scans) + len(split.broken)
+                scan, path = next(iter(split.unlabelled.items()))
                 yield (
                     f"{name}: skipped for lack of labels: {len(split.unlabelled)} of "
-                    f"{counted(total, 'scan')}, such as {split.unlabelled[0]}"
+                    f"{counted(total, 'scan')}, such as {scan}" + (f" (no {path})" if path else "")
                 )
             absent = [
                 self.taxonomy.classes[index] for index in np.flatnonzero(split.points[1:] == 0)
@@ -276,7 +278,9 @@ def check_scans(
         for record in records:
             contents = found.get(record.name)
             if contents is None:
-                report.unlabelled.append(record.name)
+                place = dataset.place_of_labels(record)
+                has_place = place != dataset.root / record.prediction
+                report.unlabelled[record.name] = str(place) if has_place else ""
             elif isinstance(contents, Contents):
                 report.add(record, contents)
             else:

@@ -92,6 +92,15 @@ class HeadStage(Stage):
         return self.one_cycle(optimizer, self.config.momentum)
 
 
+def _why_not(init: Weights | None, part: str) -> str:
+    """Return the words that say why a network of the initial weights does not count."""
+    if init is None:
+        return ""
+    if part not in init.parts:
+        return f", and --init has only {', '.join(init.parts)}"
+    return ", and that of --init has other classes"
+
+
 def train_head(plan: Plan, weights: Weights) -> None:
     """Train the point head on scores of frozen networks, and write its weights after each epoch.
 
@@ -107,9 +116,10 @@ def train_head(plan: Plan, weights: Weights) -> None:
     if plan.scores is None:  # other models have not scored the scans already
         for part in BOTH_NETWORKS:
             if part not in weights.parts:
+                advice = "train it first" if plan.init else "train it first, or give --init"
                 raise InputError(
-                    f"expected trained networks for the head, found no {part}; train it, or give "
-                    "--init"
+                    f"expected trained networks for the head, found no {part} in {plan.out}"
+                    f"{_why_not(plan.init, part)}; {advice}"
                 )
 
     # Gather the uncertain points of all scans, with their scores and neighbours.

@@ -18,18 +18,14 @@ from amvnet.data.datasets.open import is_dataset
 from amvnet.errors import InputError, listed
 from amvnet.files import alone_in, atomic_write, remove_unfinished, write_yaml
 from amvnet.outputs import check_not_read
-from amvnet.weights.file import Weights, read, save
+from amvnet.weights.file import DONE, RECORD, RUN_WEIGHTS, SETTINGS, Weights, read, save
 from amvnet.weights.parts import replace_part
 
 # Names of files in the folder of a stage.
 LAST = "last.ckpt"  # the checkpoint that --resume continues from
-DONE = "done"  # an empty file, which exists if the stage is finished
-SETTINGS = "stage.yaml"  # the settings that the stage was begun with
 
 # Names of files in the folder of a run.
-RECORD = "run.yaml"  # the inputs of each call
 RECIPE = "recipe.yaml"
-WEIGHTS = "weights.safetensors"
 CURVES = "curves.png"
 COUNTS = "class_counts.npz"  # the number of points of each class
 
@@ -115,7 +111,7 @@ class RunFolder:
         self.path = path
         self.held = held
         self.kept = kept
-        self.weights = path / WEIGHTS
+        self.weights = path / RUN_WEIGHTS
         self.curves = path / CURVES
         self.stages = {name: StageFolder(path / name) for name in PART_OF}
 
@@ -138,7 +134,7 @@ class RunFolder:
             InputError: if a file that the run would write exists in the folder of no run, or is an
                 input, or the folder is a dataset.
         """
-        names = (RECIPE, WEIGHTS, COUNTS, CURVES, RECORD, *PART_OF)
+        names = (RECIPE, RUN_WEIGHTS, COUNTS, CURVES, RECORD, *PART_OF)
         check_not_read([self.path / name for name in names], also_read)
         if self.is_run:
             return

@@ -44,6 +44,11 @@ FLOATS = ("F16", "BF16", "F32", "F64")
 COUNTS = ("I64",)
 LONGEST_DESCRIPTION = 10_000_000  # limit in characters; built-in weights have 6,000
 MAX_PARAMETERS = 500_000_000  # limit for a model; the paper's model has about 60 million
+# Names of files in the folder of a run, and in the folder of each of its stages.
+RECORD = "run.yaml"  # the inputs of each call
+RUN_WEIGHTS = "weights.safetensors"
+SETTINGS = "stage.yaml"  # the settings that the stage was begun with
+DONE = "done"  # an empty file, which exists if the stage is finished
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
 _FIELD_TYPES = {
@@ -348,15 +353,26 @@ def list_weights() -> list[str]:
     return list(built_in())
 
 
+def unfinished_stages(run: Path | str) -> list[str]:
+    """Return the stages that were begun in the folder of a run and are not finished."""
+    begun = sorted(path.parent for path in Path(run).glob(f"*/{SETTINGS}"))
+    return [folder.name for folder in begun if not (folder / DONE).is_file()]
+
+
 def _find(name_or_path: str) -> Path:
     if name_or_path.startswith(hub.PREFIX):
         return hub.fetch(name_or_path)
 
     path = built_in().get(name_or_path, Path(name_or_path))
-    run_weights = path / "weights.safetensors"  # if the path is the folder of a training run
+    run_weights = path / RUN_WEIGHTS  # if the path is the folder of a training run
     if run_weights.is_file():
         return run_weights
 
+    if (path / RECORD).is_file():
+        raise InputError(
+            f"{path}: expected the weights of a run, found one that has not finished a stage; go "
+            "on with it: amvnet train ... --resume"
+        )
     if not path.is_file():
         names = ", ".join(built_in()) or "none"
         advice = f"check the path (built in: {names})"

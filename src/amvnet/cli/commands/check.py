@@ -18,16 +18,27 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     """Check the labels of all scans to train on, to validate with and to test on.
 
     If there are too few sequences for a training, their labels are checked before this is said.
-    Of scans that a YAML file describes, the body of the car is measured, too.
+    Of scans that a YAML file describes, the body of the car is measured, too. For a folder of scans
+    without such a file, the beginning of one is written beside it.
 
     Args:
         data: the dataset.
         choice: which scans to check in addition to the labelled scans of the test split.
     """
-    from amvnet.data.datasets.open import open_dataset
+    from amvnet.data.datasets.open import open_dataset, undescribed
+    from amvnet.data.datasets.starter import write_starter
     from amvnet.sensors.measure_body import measure_body
     from amvnet.sensors.normalise import described_sensor
 
+    folder = undescribed(data)
+    if folder is not None:
+        path, found = write_starter(folder)
+        for line in found.lines():
+            report(line)
+        raise InputError(
+            f"{data}: expected a dataset, found scans that no YAML file describes; {path} is now "
+            f"the beginning of one: name its classes, and run amvnet check {path}"
+        )
     dataset = open_dataset(data)
     recordings = dataset.recordings().values()
     scans = [scan.read for recording in recordings for scan in recording]
@@ -40,8 +51,10 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     try:
         splits = choice.splits(dataset)
     except InputError:
-        if choice == TrainingChoice():  # the error is not about names that the user gave
-            _check(dataset, {"all": dataset.records(dataset.split().trainable)})
+        records = dataset.records(dataset.split().trainable)
+        # The error is not about names that the user gave.
+        if choice == TrainingChoice() and dataset.having_labels(records):
+            _check(dataset, {"all": records})
         raise
     usable = _check(dataset, splits)
     report(f"{counted(usable, 'scan')} can be trained on or scored")

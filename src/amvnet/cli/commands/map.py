@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import ScanChoice, SensorChoice, load_for, load_segmenter
+from amvnet.cli.options import ScanChoice, SensorChoice, load_for, load_segmenter, method_for
 from amvnet.config.bounds import Range
 from amvnet.engines.compute import Compute
 from amvnet.progress import counted
@@ -76,7 +76,7 @@ def map(
     request = f"{digest_of(scans, drives, loaded, *reading)}, {voxel:g} m"
     saved = SavedMap(out.with_name(f".{out.name}.unfinished.npz"), request, resume)
     builder = MapBuilder(voxel, loaded.taxonomy)
-    segmenter = load_segmenter(loaded, "amvnet", compute)
+    segmenter = load_segmenter(loaded, method_for(loaded), compute)
     with progress("mapping") as step:
         map_drive(scans, drives, segmenter, builder, saved, step)
     world = builder.build(keep_movable)

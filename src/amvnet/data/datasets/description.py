@@ -20,6 +20,7 @@ KEYS = (
     *("name", "root", "classes", "ignored", "scans", "labels", "poses", "split", "sensor"),
     *("columns", "dtype"),
 )
+OTHER_NAMES = {"names": "classes"}  # keys of the same meaning in other tools' files
 SPLITS = ("train", "val", "test")
 WILDCARDS = set("*?[")  # characters of patterns
 PLACEHOLDER = re.compile(r"\{\w*\}")
@@ -231,7 +232,7 @@ def _check_keys(title: str, tree: Any, keys: Sequence[str], required: Sequence[s
         if key not in keys:
             raise InputError(
                 f"{prefix}expected keys of {', '.join(keys)}, found {shown(key)}"
-                + did_you_mean(str(key), keys, "correct the key")
+                + did_you_mean(OTHER_NAMES.get(key, str(key)), keys, "correct the key")
             )
     for key in required:
         if key not in tree:

@@ -64,6 +64,14 @@ def is_dataset(spec: str) -> bool:
     return path.is_dir() and bool(_readers_of(path))
 
 
+def undescribed(spec: str) -> Path | None:
+    """Return the folder that a text names if no layout and no YAML file says what is in it."""
+    path = Path(os.path.expanduser(spec))
+    if not path.is_dir() or is_dataset(spec) or _did_you_mean_file(path) or _place_for(path):
+        return None
+    return path
+
+
 def _open(spec: str) -> Dataset:
     kind, _, rest = spec.partition(":")
     if kind in SIMULATED:
@@ -78,7 +86,8 @@ def _open(spec: str) -> Dataset:
         if spec.lower().endswith(ENDINGS):
             return open_own(spec)  # raises the error for a YAML file that does not exist
         raise InputError(
-            f"{path}: expected the folder of a dataset, found none{_did_you_mean_file(path)}"
+            f"{path}: expected the folder of a dataset, found none"
+            + (_did_you_mean_file(path) or "; check the path")
         )
 
     reader = READERS[kind] if kind in READERS else _guess_reader(path)
@@ -95,13 +104,13 @@ def _is_own(spec: str) -> bool:
     return spec.partition(":")[0] == OWN or is_description(spec)
 
 
-def _did_you_mean_file(path: Path, advice: str = "check the path") -> str:
-    """Return the end of a message: the YAML file of this name and an ending, or else the advice."""
+def _did_you_mean_file(path: Path) -> str:
+    """Return the end of a message, the YAML file of this name and an ending, if there is one."""
     for ending in ENDINGS:
         file = f"{path}{ending}"
         if is_description(file):
             return f"; did you mean {file}?"
-    return f"; {advice}"
+    return ""
 
 
 def _split_version(text: str) -> tuple[Path, str | None]:
@@ -124,15 +133,16 @@ def _guess_reader(path: Path) -> Reader:
     if readers:
         found = "both; write " + " or ".join(f"{kind}:PATH" for kind in READERS)
     else:
-        found = f"neither{_did_you_mean_file(path, _advice_for(path))}"
+        advice = _place_for(path) or f"`amvnet check {path}` begins a YAML file that describes it"
+        found = f"neither{_did_you_mean_file(path) or f'; {advice}'}"
     raise InputError(
         f"{path}: expected either sequences/XX/velodyne (SemanticKITTI) or v1.0-*/sample_data.json "
         f"(nuScenes), found {found}"
     )
 
 
-def _advice_for(path: Path) -> str:
-    """Return what a user can do about a folder that has the layout of no dataset."""
+def _place_for(path: Path) -> str:
+    """Return what to give instead of a folder that has the layout of no dataset; "" if unknown."""
     folder = path.absolute()
     for parent in folder.parents[:DEEPEST]:
         # `matches` is not enough: a dataset in the parent may lie next to this unrelated folder.
@@ -141,4 +151,4 @@ def _advice_for(path: Path) -> str:
     described = [file for file in sorted(path.iterdir()) if file.suffix.lower() in ENDINGS]
     if described:
         return f"give the YAML file that describes the scans, such as {described[0]}"
-    return "describe the scans in a YAML file (docs/own_data.md)"
+    return ""

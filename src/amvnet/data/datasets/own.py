@@ -19,14 +19,18 @@ from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.poses import Poses, read_poses, times_of
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError, did_you_mean, readable, reason_of, shown
+from amvnet.progress import counted
 from amvnet.scan import Scan
+
+VALIDATING = 10  # the last one of so many scans validates by default
 
 
 class OwnScans(Dataset):
     """A user's labelled scans. `Dataset` documents the arguments and errors of its methods.
 
     A scan's sequence is the first folder below the part of the pattern that has no wildcards. If
-    the split cuts through a folder, its parts are sequences: `site-train`, `site-val`.
+    the split cuts through a folder, its parts are sequences: `site-train`, `site-val`. A single
+    sequence with labels is cut even without a split.
     """
 
     def __init__(self, description: Description, normalise: Normalise | None = None) -> None:
@@ -45,8 +49,11 @@ class OwnScans(Dataset):
         return {name: tuple(sorted(sequences)) for name, sequences in parts.items()}
 
     def split(self) -> Split:
-        """Return how the file splits the sequences, if it does."""
-        return dataclasses.replace(super().split(), is_given=bool(self.description.split))
+        """Return how the file splits the sequences, or how the only sequence with labels is cut."""
+        cut = self._cut
+        note = f"no split: {counted(len(cut), 'scan')} from {cut[0]} on validate" if cut else ""
+        is_given = bool(self.description.split)
+        return dataclasses.replace(super().split(), is_given=is_given, note=note)
 
     def lacks(self, split: str) -> str:
         """Return the error that says which splits the file has, if any."""
@@ -57,7 +64,7 @@ class OwnScans(Dataset):
             found = f"no split{alone}"
         return (
             f"{self.spec}: expected scans of the split {split}, found {found}; name them under "
-            "split, or name sequences to use"
+            f"split, such as {split}: [{self._listing[-1][0].name}], or name sequences to use"
         )
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
@@ -239,20 +246,39 @@ class OwnScans(Dataset):
             if len(splits_of_folder[sequence]) > 1:
                 sequence = f"{sequence}-{splits[name] or 'rest'}"
 
-            place = self.description.labels
-            labels_path = None if place is None else place.path_of(scan.path, scan.name)
-            with readable(f"{self.spec}: labels: {shown(str(labels_path))}"):
-                has_labels = labels_path is not None and labels_path.is_file()
-
             record = ScanRecord(
                 name=name,
                 sequence=sequence,
                 points_path=scan.path,
-                labels_path=labels_path if has_labels and self.description.unread is None else None,
+                labels_path=self._labels.get(name) if self.description.unread is None else None,
                 prediction=f"{name}.label",
             )
             listing.append((record, splits[name]))
         return listing
+
+    @cached_property
+    def _labels(self) -> dict[str, Path]:
+        """The label files that exist, by the name of the scan."""
+        place = self.description.labels
+        paths = {}
+        for name, scan in self._scans.items():
+            if place is not None:
+                path = place.path_of(scan.path, scan.name)
+                with readable(f"{self.spec}: labels: {shown(str(path))}"):
+                    if path.is_file():
+                        paths[name] = path
+        return paths
+
+    @cached_property
+    def _cut(self) -> list[str]:
+        """The scans that validate by default if a single sequence has labels: its last tenth."""
+        folders = {self._folder_of(name) for name in self._labels}
+        labelled = list(self._labels)
+        if self.description.split or len(folders) != 1 or len(labelled) < 2:
+            return []
+        first = labelled[-max(len(labelled) // VALIDATING, 1)]
+        names = [name for name in self._scans if self._folder_of(name) in folders]
+        return names[names.index(first) :]
 
     def _folder_of(self, name: str) -> str:
         """Return the name of the folder that is the sequence of a scan."""
@@ -267,6 +293,12 @@ class OwnScans(Dataset):
 
         If the file has a split without "train", the scans that it does not name are in "train".
         """
+        if self._cut:
+            folder = self._folder_of(self._cut[0])
+            trained = [name for name in self._scans if self._folder_of(name) == folder]
+            parts = dict.fromkeys(self._scans, "") | dict.fromkeys(trained, "train")
+            return parts | dict.fromkeys(self._cut, "val")
+
         entries = []
         for split, names in self.description.split.items():
             entries += [(split, entry) for entry in names]
@@ -289,7 +321,10 @@ class OwnScans(Dataset):
         for split, entry in entries:
             if (split, entry) not in matched:
                 folders = dict.fromkeys(map(self._folder_of, self._scans))
-                advice = f"name a folder ({', '.join(list(folders)[:20])}), a scan or a pattern"
+                advice = (
+                    f"name a folder ({', '.join(list(folders)[:20])}), or a scan or a pattern with "
+                    f"all its folders, such as {next(iter(self._scans))}"
+                )
                 raise InputError(
                     f"{self.spec}: split: {split}: expected entries that match scans, found "
                     f"{shown(entry)}, which matches none" + did_you_mean(entry, folders, advice)
@@ -306,7 +341,9 @@ class OwnScans(Dataset):
 
         found = set()
         for split, entry in entries:
-            if entry in texts or (set(entry) & WILDCARDS and fnmatchcase(name, entry)):
+            if entry in texts or (
+                set(entry) & WILDCARDS and (fnmatchcase(name, entry) or fnmatchcase(file, entry))
+            ):
                 found.add((split, entry))
         return found
 

@@ -76,6 +76,8 @@ def _too_few(
     dataset: Dataset, split: Split, train: Sequence[str] | None, val: Sequence[str] | None
 ) -> str:
     """Return the error that says why no sequence is left to train on or to validate with."""
+    if not split.having_labels(split.part("all")):
+        dataset.labelled(dataset.records(split.part("all")))  # raises
     trainable = split.trainable
     if not (train or val or split.is_given) and len(trainable) < 2:
         return (

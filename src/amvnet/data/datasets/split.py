@@ -19,11 +19,13 @@ class Split:
         is_given: whether the dataset says itself what trains and what validates. If not, all
             sequences outside "test" do.
         having_labels: returns those of some sequences that have labels.
+        note: what a user should know about a split that nobody named.
     """
 
     parts: Mapping[str, Names]
     is_given: bool
     having_labels: Callable[[Names], Names]
+    note: str = ""
 
     def part(self, name: str) -> Names:
         """Return the sequences of a split of the dataset, which may be none."""

@@ -1,0 +1,215 @@
+"""Write a YAML file with which a user begins to describe a folder of scans."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from amvnet.data.datasets.description import ENDINGS, LabelPlace
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.detect import named_ending
+from amvnet.data.formats.find import list_scans, scan_stem
+from amvnet.data.labels.readers import COLUMNS, read_raw_labels
+from amvnet.data.spacing import evenly_spaced
+from amvnet.data.taxonomy import INSTANCE_MASK
+from amvnet.errors import InputError
+from amvnet.files import atomic_write
+from amvnet.progress import counted
+
+COUNTED_FILES = 20  # number of label files whose ids are counted
+MOST_CLASSES = 50  # largest number of ids that become classes
+UNLABELLED = (0, INSTANCE_MASK)  # ids that usually stand for no label; the second one is -1
+REST = "rest"
+TRIED_FILES = 3  # number of files of a kind, one of which must be a scan
+
+SUFFIX = re.compile(r"[_.-][A-Za-z]+$")  # the end of a stem that tells labels from scans
+
+Group = tuple[str, str, str]  # files with an ending, in folders of a name, and with a SUFFIX
+
+
+@dataclass(frozen=True)
+class Found:
+    """The scans in a folder, and their labels.
+
+    Attributes:
+        scans: the files of the scans, sorted.
+        pattern: a pattern that matches them, relative to the folder.
+        first: the first scan.
+        labels: the place of the labels; None if there are none.
+        labelled: the number of scans with labels.
+        ids: the number of points by raw id in some of the labels, most first.
+    """
+
+    scans: Sequence[Path]
+    pattern: str
+    first: Cloud
+    labels: LabelPlace | None = None
+    labelled: int = 0
+    ids: Mapping[int, int] = field(default_factory=dict)
+
+    def lines(self) -> Iterator[str]:
+        """Yield lines that say what was found."""
+        columns = ["x", "y", "z"]
+        for name in ("intensity", "ring"):
+            if getattr(self.first, name) is not None:
+                columns.append(name)
+        yield (
+            f"{counted(len(self.scans), 'scan')} {self.pattern} with {', '.join(columns)}; "
+            f"{len(self.first.xyz):,} points in the first one"
+        )
+        if self.labels is None:
+            yield f"no file with a label for each point of {self.scans[0]}"
+        else:
+            ids = ", ".join(f"{raw} ({count:,})" for raw, count in self.ids.items())
+            place = _yaml(_entry(self.labels))
+            yield f"labels of {counted(self.labelled, 'scan')} at {place}; points by id: {ids}"
+
+    def text(self, root: str) -> str:
+        """Return the YAML file, which lies beside the folder `root`."""
+        total = sum(self.ids.values())
+        classes = [raw for raw in self.ids if raw not in UNLABELLED][:MOST_CLASSES]
+        ignored: list[int | str] = []
+        for raw in self.ids:
+            if raw not in classes:
+                ignored.append({INSTANCE_MASK: -1, 0: 0}.get(raw, REST))
+        lines = [
+            "# Give each class a name; one class may have several ids, as [1, 2].",
+            "# docs/own_data.md explains all keys.",
+            f"root: {_yaml(root)}",
+            f"scans: {_yaml(self.pattern)}",
+        ]
+        if self.labels is None:
+            lines.append('# labels: "{name}.label"  # where the file with a label per point is')
+            lines += ["classes:", "  first: 1  # the name of a class, and its id", "  second: 2"]
+        else:
+            lines += [f"labels: {_yaml(_entry(self.labels))}", "classes:"]
+            lines += [f"  class_{raw}: {raw}  # {self.ids[raw] / total:.1%}" for raw in classes]
+        lines.append(f"ignored: {_yaml(list(dict.fromkeys(ignored)))}  # ids without a class")
+        return "\n".join([*lines, ""])
+
+
+def write_starter(folder: Path) -> tuple[Path, Found]:
+    """Write the YAML file of a folder beside it; return its path, and what is in the folder.
+
+    Raises:
+        InputError: if there is no scan in the folder or below it.
+    """
+    folder = folder.absolute()
+    found = find_labelled(folder)
+    path = folder.with_name(f"{folder.name}{ENDINGS[0]}")
+    with atomic_write(path) as part:
+        part.write_text(found.text(folder.name), encoding="utf-8")
+    return path, found
+
+
+def find_labelled(folder: Path) -> Found:
+    """Find the scans in a folder and below it, and their labels.
+
+    Raises:
+        InputError: if there is no scan.
+    """
+    groups: dict[Group, list[Path]] = defaultdict(list)
+    for path in sorted(folder.rglob("*")):
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if path.is_file() and not hidden:
+            suffix = SUFFIX.search(scan_stem(path))
+            ending = named_ending(path) or path.suffix
+            groups[ending, path.parent.name, suffix[0] if suffix else ""].append(path)
+
+    first = {group: found for group, paths in groups.items() if (found := _first_scan(paths))}
+    places: dict[Group, LabelPlace] = {}
+    of_labels = set()
+    for group, (scan, cloud) in first.items():
+        for other, paths in groups.items():
+            place = None if other == group else _place_among(paths, scan, len(cloud.xyz))
+            if place is not None:
+                places[group] = place
+                of_labels.add(other)  # even if they can be read as points
+        inside = _place_inside(scan, len(cloud.xyz))
+        if inside is not None:
+            places.setdefault(group, inside)
+
+    scans = [group for group in first if group not in of_labels]
+    if not scans:
+        raise InputError(f"{folder}: expected scans, found none that can be read; name others")
+    best = max(scans, key=lambda group: (group in places, len(groups[group])))
+    paths = sorted(path for group in scans if group[0] == best[0] for path in groups[group])
+    pattern = _pattern_of([path.relative_to(folder) for path in paths], best[0])
+    place = places.get(best)
+    if place is None:
+        return Found(paths, pattern, first[best][1])
+
+    labelled = [path for path in paths if place.path_of(path, scan_stem(path)).is_file()]
+    return Found(paths, pattern, first[best][1], place, len(labelled), _ids_of(labelled, place))
+
+
+def _first_scan(paths: Sequence[Path]) -> tuple[Path, Cloud] | None:
+    """Return the first file that can be read as a scan, if one of the first ones can."""
+    for path in paths[:TRIED_FILES]:
+        with suppress(InputError):
+            return path, next(iter(list_scans(path))).read()
+    return None
+
+
+def _place_among(paths: Sequence[Path], scan: Path, count: int) -> LabelPlace | None:
+    """Return the place of the labels if one of some files has a label for each point of a scan."""
+    stem = scan_stem(scan)
+    named = [path for path in paths if stem in path.name]
+    for path in sorted(named, key=lambda path: len(os.path.relpath(path, scan.parent))):
+        with suppress(InputError):
+            read_raw_labels(path, count, missing=0)
+            folder = Path(os.path.relpath(path.parent, scan.parent))
+            return LabelPlace((folder / path.name.replace(stem, "{name}", 1)).as_posix())
+        break
+    return None
+
+
+def _place_inside(scan: Path, count: int) -> LabelPlace | None:
+    """Return the place of the labels if a column of the scan's file holds them."""
+    for column in COLUMNS:
+        with suppress(InputError):
+            read_raw_labels(scan, count, column, missing=0)
+            return LabelPlace(field=column)
+    return None
+
+
+def _ids_of(scans: Sequence[Path], place: LabelPlace) -> dict[int, int]:
+    """Return the number of points by raw id in the labels of some of the scans, most first."""
+    ids: Counter[int] = Counter()
+    for scan in evenly_spaced(scans, COUNTED_FILES):
+        with suppress(InputError):
+            count = len(next(iter(list_scans(scan))).read().xyz)
+            labels = read_raw_labels(
+                place.path_of(scan, scan_stem(scan)), count, place.field, missing=0
+            )
+            values, counts = np.unique(labels & INSTANCE_MASK, return_counts=True)
+            ids.update(dict(zip(values.tolist(), counts.tolist(), strict=True)))
+    return dict(ids.most_common())
+
+
+def _pattern_of(paths: Sequence[Path], ending: str) -> str:
+    """Return a pattern that matches files with an ending in the folders of some paths."""
+    depths = {len(path.parts) for path in paths}
+    if len(depths) > 1:
+        return f"**/*{ending}"
+    levels = zip(*(path.parent.parts for path in paths), strict=True)
+    folders = [names[0] if len(set(names)) == 1 else "*" for names in levels]
+    return "/".join([*folders, f"*{ending}"])
+
+
+def _entry(place: LabelPlace) -> str | dict[str, str]:
+    """Return the place of labels as the value of `labels`."""
+    return {"field": place.field} if place.field is not None else place.file or ""
+
+
+def _yaml(value: object) -> str:
+    """Return a value on one line of YAML; JSON is YAML."""
+    return json.dumps(value, ensure_ascii=False)
