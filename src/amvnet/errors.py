@@ -120,8 +120,13 @@ def import_optional(module: str, extra: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise InputError(
-            f"expected the package {error.name}, found none; run pip install 'amvnet[{extra}]'"
+            f"expected the package {error.name}, found none; run {installation(extra)}"
         ) from None
+
+
+def installation(extra: str) -> str:
+    """Return the command that adds an extra, to a clone as well as to a published package."""
+    return f'pip install "amvnet[{extra}]"'
 
 
 @contextmanager

@@ -6,6 +6,10 @@ import itertools
 import json
 import re
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.metadata import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,9 +18,12 @@ import numpy as np
 import pytest
 
 import amvnet
-from amvnet.cli.main import COMMANDS, main
+from amvnet.cli.main import COMMANDS, GROUPS, main
+from amvnet.cli.tables import EXTRAS
 from amvnet.config.recipes import recipe_names
 from amvnet.inference import timing
+from amvnet.inference.journal import Entry
+from amvnet.inference.pipeline import Pipeline
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
@@ -25,6 +32,8 @@ from amvnet.weights.file import built_in
 from fixtures.commands import files, refusal, refused, run_cli, succeed
 from fixtures.marks import with_quick
 from fixtures.tiny import GOLDEN
+
+predict_command = import_module("amvnet.cli.commands.predict")
 
 
 @pytest.fixture(scope="module")
@@ -331,7 +340,7 @@ def test_info_says_what_the_weights_are(world: Path, capsys: pytest.CaptureFixtu
 def test_info_says_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info"]) == 0
     text = capsys.readouterr().out
-    for word in ("torch", "lightning", "semantickitti-compact", "cpu"):
+    for word in ("torch", "lightning", "sim-hdl64e", "cpu"):
         assert word in text
 
 
@@ -384,3 +393,79 @@ def test_info_has_no_dictionaries(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     assert "{" not in text
     assert re.search(r"(?m)^\| rv.epochs \| \d+ \|$", text)
+
+
+def test_the_help_has_each_command_in_one_group(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    words = re.findall(r"(?m)^(\w+):$|^  (\w+) ", capsys.readouterr().out)
+    assert [title for title, _ in words if title] == list(GROUPS)
+    assert [command for _, command in words if command] == list(COMMANDS)
+    assert len(COMMANDS) == sum(map(len, GROUPS.values()))
+
+
+def test_info_lists_weights_and_every_extra_of_users(capsys: pytest.CaptureFixture[str]) -> None:
+    succeed("info")
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in built_in())
+    assert set(EXTRAS) == set(metadata("amvnet").get_all("Provides-Extra")) - {"docs", "test"}
+    assert all(re.search(rf"(?m)^ {extra} .*(yes|no)", printed) for extra in EXTRAS)
+    assert "pytest" not in printed
+
+
+def test_a_name_without_its_last_letter_is_answered_with_the_sensor(world: Path) -> None:
+    refused(f"predict {world}/lone.bin --sensor hdl64", "did you mean hdl64e?")
+
+
+def test_what_to_do_next_is_said_once(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = f"predict {world}/lone.bin --weights {world}/w.safetensors --out {tmp_path}/out"
+    succeed(command)
+    assert "look at them: " in capsys.readouterr().out
+    succeed(f"{command} --overwrite")
+    assert "look at them: " not in capsys.readouterr().out
+
+
+def test_unlabelled_points_are_explained(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = np.fromfile(world / "lone.bin", np.float32).reshape(-1, 4)
+    points[:9, :3] = 0
+    points.tofile(tmp_path / "lost.bin")
+    weights = f"--weights {world}/w.safetensors --out {tmp_path}"
+    succeed(f"predict {tmp_path}/lost.bin {weights}/a")
+    printed = capsys.readouterr().out
+    assert re.search(r"unlabelled +│ +9 ", printed)
+    assert "unlabelled points are lost returns" in printed
+    succeed(f"predict {world}/lone.bin {weights}/b")
+    assert "lost returns" not in capsys.readouterr().out
+
+
+def test_progress_of_a_drive_counts_the_scans_that_are_segmented(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans = 9
+    calls: list[tuple[int, int]] = []
+    written: list[int] = []
+
+    @contextmanager
+    def progress(_title: str) -> Iterator[Callable[[int, int], None]]:
+        yield lambda done, total: calls.append((done, total))
+
+    def write(*arguments: Any) -> Entry:
+        written.append(len(calls))
+        return original(*arguments)
+
+    original = Pipeline.write
+    monkeypatch.setattr(Pipeline, "write", write)
+    monkeypatch.setattr(predict_command, "progress", progress)
+    np.save(tmp_path / "poses.npy", np.tile(np.eye(4), (scans, 1, 1)))
+    (tmp_path / "drive").mkdir()
+    for index in range(scans):
+        shutil.copy(world / "lone.bin", tmp_path / f"drive/{index}.bin")
+    succeed(
+        f"predict {tmp_path}/drive --weights {world}/w.safetensors --out {tmp_path}/out --drive "
+        f"--poses {tmp_path}/poses.npy"
+    )
+    assert calls == [(done, scans) for done in range(scans + 1)]
+    assert min(written) > 2  # the first scan waits for others, which are counted

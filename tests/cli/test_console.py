@@ -66,6 +66,8 @@ def test_a_line_has_the_pace_and_the_time_left(lines_at: LinesAt) -> None:
     done = [int(re.fullmatch(PROGRESS_LINE, text)[1]) for text in texts]  # type: ignore[index]
     assert done == list(range(10, 101, 10))
     assert "2 a second" in lines_at(0.5, 100)[0][1]
+    # A few things, such as the graphs of an export, are not alike.
+    assert lines_at(30, 6)[0][1] == "segmenting: 1 of 6"
 
 
 # ---- what reaches the terminal

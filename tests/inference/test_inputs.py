@@ -80,8 +80,9 @@ def test_if_the_first_scans_of_a_folder_differ_each_is_measured_alone(
         expected = normalised(tmp_path / name)[0][name]
         np.testing.assert_array_equal(scan.points, expected.points)
         np.testing.assert_array_equal(scan.ring, expected.ring)
-    assert len(lines) == 1
-    assert "has scans of other sensors, so that each is measured alone" in lines[0]
+    assert len(lines) == 2  # one of each sensor
+    for line in lines:
+        assert "has scans of other sensors, so that each is measured alone" in line
 
 
 def test_a_scan_of_another_sensor_after_the_first_ones_is_measured_alone_and_told(
@@ -152,6 +153,26 @@ def test_each_recording_is_judged_by_its_own_share() -> None:
     assert len(lines) == 4
 
 
+def test_a_doubtful_scan_is_named_and_not_the_mean_of_its_folder() -> None:
+    def of_folder(name: str, share: float, points: int = 1000) -> Entry:
+        return Entry(f"{name}.npz", "", "folder", points, round(share * points), [])
+
+    for points in (100, 9000):  # the mean is doubtful with the second one
+        lines = said([of_folder("good", 0.1), of_folder("bad", 0.9, points)])
+        assert "warning: bad: do not rely on these labels: 90.0%" in lines[1]
+        assert lines[2:] == [f"warning: {ADVICE}"]
+
+
+def test_what_is_assumed_of_each_sensor_in_a_folder_is_said_once(tmp_path: Path) -> None:
+    for seed, sensor in enumerate(["vlp16", "os1-64"] * 4):
+        write(tmp_path / "both", f"s{seed}", sensor, 0.9 if sensor == "vlp16" else 1.4, seed)
+    _, _, lines = normalised(tmp_path / "both")
+    assumed = [line for line in lines if "assumed" in line]
+    assert len(assumed) == 2
+    assert "-15" in assumed[0]
+    assert "-22" in assumed[1] or "-23" in assumed[1]
+
+
 def test_one_doubtful_recording_is_one_line() -> None:
     (line,) = said([entry("drive", 0.8)])
     assert line.startswith("warning: do not rely")
@@ -162,7 +183,7 @@ def test_one_doubtful_recording_is_one_line() -> None:
 def test_many_doubtful_recordings_are_few_lines() -> None:
     lines = said([entry(str(index), 0.9) for index in range(50)])
     assert len(lines) == 12
-    assert "40 other recordings" in lines[-1]
+    assert "40 more" in lines[-1]
     lines = said([entry(str(index), 0.9) for index in range(10)])
     assert lines[-1] == f"warning: {ADVICE}"
 

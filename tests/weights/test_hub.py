@@ -194,5 +194,5 @@ def test_without_the_client_the_message_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    fails(lambda: load(NAME), "pip install 'amvnet[hub]'")
-    fails(lambda: amvnet.push(WEIGHTS, NAME), "pip install 'amvnet[hub]'")
+    fails(lambda: load(NAME), 'pip install "amvnet[hub]"')
+    fails(lambda: amvnet.push(WEIGHTS, NAME), 'pip install "amvnet[hub]"')

@@ -22,6 +22,7 @@ from amvnet.fleet.secrets import without_secrets
 from amvnet.progress import Progress, Tenths
 
 LONGEST_LINE = 5000  # longest line that is printed in full, characters
+FEW = 10  # smallest number of things that are alike enough for their pace to tell the time left
 MAX_LINES = 2000  # largest number of lines that are printed of one text
 
 
@@ -165,11 +166,11 @@ class ProgressLines:
         """Report the progress if another tenth of the work is done."""
         if self.tenths.ends(done, total):
             pace = self._pace(done, total, time.monotonic() - self.start)
-            report(f"{self.title}: {done} of {total}, {pace}")
+            report(f"{self.title}: {done} of {total}{pace if total >= FEW else ''}")
 
     def _pace(self, done: int, total: int, elapsed: float) -> str:
-        """Return the rate and the time left after some seconds: "2.1 a second, 0:01:16 left"."""
+        """Return the rate and the time left after some seconds: ", 2.1 a second, 0:01:16 left"."""
         rate = done / elapsed
         pace = f"{rate:.3g} a second" if rate >= 1 else f"{1 / rate:.3g} s each"
         left = timedelta(seconds=round((total - done) / rate))
-        return f"{pace}, {left} left"
+        return f", {pace}, {left} left"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -34,10 +34,16 @@ from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
-# The functions of the commands, in the order of the help; two parts fit into two lines.
-_FIRST = (demo, simulate, check, train, adapt, predict, fleet, evaluate, map_drive, submit, fuse)
-_LAST = (rank, analyze, ablate, export, view, bench, list_names, info)
-COMMANDS = {function.__name__: function for function in _FIRST + _LAST}
+# The functions of the commands by what they are for, in the order of the help.
+GROUPS: dict[str, tuple[Callable[..., None], ...]] = {
+    "label": (predict, map_drive, fuse, fleet),
+    "look": (demo, view, list_names, info),
+    "score": (evaluate, analyze, rank, submit),
+    "train": (train, adapt, ablate),
+    "data": (simulate, check),
+    "deploy": (export, bench),
+}
+COMMANDS = {function.__name__: function for group in GROUPS.values() for function in group}
 WITH_RESUME = ("train", "adapt", "map", "predict", "fleet")  # commands that have --resume
 CONTINUED_WHEN_REPEATED = ("simulate", "ablate")  # commands that keep results of an earlier call
 WITH_PROCESSES = ("train", "evaluate", "ablate")  # commands whose work several processes can share
@@ -77,9 +83,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _usage() -> str:
     """Return the help of `amvnet`: what each command does."""
-    lines = ["usage: amvnet COMMAND ...", ""]
-    for command, function in COMMANDS.items():
-        lines.append(f"  {command:<10} {first_line(function)}")
+    lines = ["usage: amvnet COMMAND ..."]
+    for title, functions in GROUPS.items():
+        lines += ["", f"{title}:"]
+        for function in functions:
+            lines.append(f"  {function.__name__:<10} {first_line(function)}")
     more = f"`amvnet COMMAND --help` says more. Version {version('amvnet')}."
     return "\n".join([*lines, "", more])
 

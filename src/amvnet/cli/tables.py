@@ -15,6 +15,7 @@ from rich.table import Table
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.check import Report
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import installation
 from amvnet.evaluation.metrics import OVERALL
 from amvnet.inference.journal import Entry
 from amvnet.inference.timing import MEAN, STAGES
@@ -22,6 +23,18 @@ from amvnet.models.methods import title_of
 from amvnet.progress import counted
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import built_in, load
+
+MISSING = "not installed"
+# What users need the extras for; `docs` and `test` are for developers.
+EXTRAS = {
+    "simulate": "amvnet demo, simulate and adapt",
+    "formats": ".las, .laz and bags",
+    "feather": ".feather",
+    "drives": "poses of drives that have none",
+    "export": "amvnet export, --engine onnx and int8",
+    "fleet": "amvnet fleet",
+    "hub": "weights on the Hugging Face hub",
+}
 
 
 def _table(title: str | None, texts: Iterable[str], numbers: Iterable[str]) -> Table:
@@ -189,10 +202,9 @@ def sensors_table() -> Table:
 
 
 def installation_table() -> Table:
-    """Return the table of the installation: versions, devices, built-in weights and recipes."""
+    """Return the table of the installation: versions and devices."""
     table = Table(title="AMVNet", show_header=False, show_edge=False)
-    required = [re.split(r"[^\w.-]", line)[0] for line in metadata.requires("amvnet") or ()]
-    for name in ("amvnet", *dict.fromkeys(required)):  # each package once
+    for name in ("amvnet", *_required("")):
         table.add_row(name, _version(name))
     table.add_row("python", platform.python_version())
 
@@ -201,16 +213,36 @@ def installation_table() -> Table:
         devices.append(torch.cuda.get_device_name(index))
     table.add_row("devices", ", ".join(devices))
     table.add_row("threads", str(torch.get_num_threads()))
-    table.add_row("weights", ", ".join(built_in()) or "none")
-    table.add_row("recipes", ", ".join(recipe_names()))
     return table
+
+
+def extras_table() -> Table:
+    """Return the table of the extras: what they are for, and what installs those that miss."""
+    table = Table(title="extras", show_edge=False)
+    for name in ("extra", "for", "installed"):
+        table.add_column(name, overflow="fold")
+    for extra, purpose in EXTRAS.items():
+        is_installed = all(_version(name) != MISSING for name in _required(extra))
+        found = "yes" if is_installed else f"no: {installation(extra)}"
+        table.add_row(extra, purpose, found)
+    return table
+
+
+def _required(extra: str) -> list[str]:
+    """Return the packages that an extra needs, or without an extra those that are always needed."""
+    names = []
+    for line in metadata.requires("amvnet") or ():
+        of_extra = re.search(r"extra == ['\"](.+?)['\"]", line)
+        if (of_extra[1] if of_extra else "") == extra:
+            names.append(re.split(r"[^\w.-]", line)[0])
+    return list(dict.fromkeys(names))  # each package once
 
 
 def _version(name: str) -> str:
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
-        return "not installed"
+        return MISSING
 
 
 def _percent(value: float | None) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -132,17 +132,13 @@ class Pipeline:
 
             faults: list[str] = []
             with Journal(folder, settings, kept.values()) as journal:
-                count = 0
-                for outcome in self.stream(segmented, write):
+                for outcome in self.stream(segmented, write, progress=progress):
                     if outcome is None:
                         continue
-                    progress(count, len(remaining))
-                    count += 1
                     if isinstance(outcome, Entry):
                         journal.add(outcome)
                     else:
                         faults.append(outcome)
-                progress(len(remaining), len(remaining))
                 entries = journal.close()
             return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
@@ -185,13 +181,18 @@ class Pipeline:
         return origins
 
     def stream(
-        self, scans: Sequence[InputScan], write: Callable[[Outcome], Written], writers: int = 1
+        self,
+        scans: Sequence[InputScan],
+        write: Callable[[Outcome], Written],
+        writers: int = 1,
+        progress: Progress = no_progress,
     ) -> Iterator[Written]:
         """Read, segment and write scans; only a few are in memory at a time.
 
         Args:
             write: takes the outcomes in order, except that scans that cannot be read may come
                 earlier. `writers` other threads call it.
+            progress: called as scans are segmented; a drive's scans are written much later.
 
         Yields:
             The values that `write` returns.
@@ -206,7 +207,7 @@ class Pipeline:
         writing = deque[Future[Written]]()
         # Reading, computing and writing go on at the same time, each on other scans.
         with closing(groups), ThreadPoolExecutor(writers) as pool:
-            outcomes: Iterator[Outcome] = chain.from_iterable(groups)
+            outcomes = _counted(chain.from_iterable(groups), len(scans), progress)
             if self.drives is not None:
                 outcomes = self.drives.fuse(outcomes)
             for outcome in outcomes:
@@ -274,6 +275,14 @@ class Pipeline:
         counts = np.bincount(result.labels[~own]).tolist()
         values = key, self._origins[key], scan.source, points, uncertain, counts
         return Entry(*values, int(np.count_nonzero(own)))
+
+
+def _counted(outcomes: Iterable[Outcome], total: int, progress: Progress) -> Iterator[Outcome]:
+    """Yield outcomes, and report how many there were."""
+    progress(0, total)
+    for count, outcome in enumerate(outcomes, start=1):
+        progress(count, total)
+        yield outcome
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
+from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.drive import DriveOptions, Drives, find_poses, key_of
@@ -14,12 +15,12 @@ from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_ou
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
-from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
+from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.verdict import Verdict
 
-SHOWN_RECORDINGS = 10  # the most doubtful recordings that are named, each in a line
+SHOWN_RECORDINGS = 10  # the most doubtful recordings or scans that are named, each in a line
 # What a user can try if the labels are doubtful.
 ADVICE = (
     "check what was assumed, and try --height, --axes, --rotate or --intensity-scale, "
@@ -99,33 +100,39 @@ def segment_by(
 def report_certainty(
     entries: Sequence[Entry], method: str, usual: float | None, report: Reporter
 ) -> None:
-    """Report how sure the labels are, which recordings have doubtful labels, and what to try.
+    """Report how sure the labels are, which recordings or scans have doubtful labels, and advice.
 
+    A recording is named if all of its scans are doubtful or their sum is, and else those that are.
     The usual share of uncertain points is in [0, 1]; None if it is not known.
     """
-    points: Counter[str] = Counter()
-    uncertain: Counter[str] = Counter()
+    recordings: dict[str, list[Entry]] = {}
     for entry in entries:
         if entry.points:
-            points[entry.sensor] += entry.points
-            uncertain[entry.sensor] += entry.uncertain
-    if not points:
+            recordings.setdefault(entry.sensor, []).append(entry)
+    if not recordings:
         return
 
-    doubtful = {}
-    for sensor in points:
-        verdict = Verdict.of(method, uncertain[sensor] / points[sensor], usual)
-        if verdict.is_doubtful:
-            doubtful[sensor] = verdict
+    def judge(some: Iterable[Entry]) -> Verdict:
+        counts = [(entry.uncertain, entry.points) for entry in some]
+        uncertain, points = map(sum, zip(*counts, strict=True))
+        return Verdict.of(method, uncertain / points, usual)
 
-    verdict = Verdict.of(method, uncertain.total() / points.total(), usual)
-    if len(points) == 1 or not doubtful:
-        report(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else verdict.shares)
+    doubtful: dict[str, Verdict] = {}
+    for sensor, scans in recordings.items():
+        bad = [entry for entry in scans if judge([entry]).is_doubtful]
+        if 0 < len(bad) < len(scans):
+            doubtful |= {str(Path(entry.scan).with_suffix("")): judge([entry]) for entry in bad}
+        elif judge(scans).is_doubtful:
+            doubtful[sensor] = judge(scans)
+
+    verdict = judge(chain.from_iterable(recordings.values()))
+    if not doubtful or (list(doubtful) == list(recordings) and len(recordings) == 1):
+        report(f"warning: {verdict}; {ADVICE}" if doubtful else verdict.shares)
         return
 
     report(verdict.shares)
-    for sensor in list(doubtful)[:SHOWN_RECORDINGS]:
-        report(f"warning: {sensor}: {doubtful[sensor]}")
+    for name in list(doubtful)[:SHOWN_RECORDINGS]:
+        report(f"warning: {name}: {doubtful[name]}")
     others = len(doubtful) - SHOWN_RECORDINGS
-    more = f"the same holds for {counted(others, 'other recording')}; " if others > 0 else ""
+    more = f"the same holds for {others} more; " if others > 0 else ""
     report(f"warning: {more}{ADVICE}")

@@ -252,7 +252,7 @@ def _read_sensor(text: str) -> Sensor:
     path = Path(text)
     if path.suffix not in (".yaml", ".yml"):
         models = _models_of(text)
-        if models:
+        if len(models) > 1:
             raise InputError(
                 f"expected the model of a LiDAR, found {shown(text)}; name one of "
                 f"{', '.join(models)}, or give a YAML file"

@@ -154,14 +154,16 @@ class Normaliser:
         scan, ring_fault = normalise(cloud, estimate, self.sensor, self.expected)
 
         title = source if is_usual else f"{source}, other sensors"
-        if title not in self._reported:
+        is_new = title not in self._reported
+        if is_new or recording.is_mixed:
             self._reported.add(title)
             line = describe(cloud, estimate, self.sensor, self.expected, ring_fault)
             if recording.is_mixed:
                 line += f"; {source} has scans of other sensors, so that each is measured alone"
             if not is_usual:
                 line += f"; another sensor or scale of intensity than {source} begins with"
-            if not is_usual or recording.is_mixed or not self._is_described(cloud, estimate):
+            is_described = self._is_described(cloud, estimate)
+            if (is_new and (not is_usual or recording.is_mixed)) or not is_described:
                 self._report(line)
                 stated = estimate.contradiction(self.sensor)
                 if stated:

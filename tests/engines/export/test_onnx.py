@@ -444,7 +444,7 @@ def test_without_the_extra_the_command_is_said(
 ) -> None:
     pytest.importorskip("onnx")
     monkeypatch.setitem(sys.modules, library, None)
-    refused(f"export --weights sim-hdl64e --out {tmp_path}/out", "pip install 'amvnet[export]'")
+    refused(f"export --weights sim-hdl64e --out {tmp_path}/out", 'pip install "amvnet[export]"')
     assert not (tmp_path / "out").exists()
 
 

@@ -60,6 +60,7 @@ def predict(
     """
     from amvnet.cli.tables import labelled_table
     from amvnet.engines.precision import resolved
+    from amvnet.inference.journal import JOURNAL
     from amvnet.inference.listing import find_inputs
     from amvnet.inference.pipeline import check_faults
     from amvnet.inference.predict import predict as predict_inputs
@@ -74,6 +75,7 @@ def predict(
     where = f"; labels go to {out}"
     weights, loaded = load_for(found, weights, sensor_choice.parse(), where)
     request = labels.parse(loaded, choice, sensor_choice, compute)
+    is_new = not (Path(out) / JOURNAL).exists()
     also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, drive_choice.poses)
 
     def make_segmenter() -> Segmenter:
@@ -93,14 +95,18 @@ def predict(
 
     if entries:
         show(labelled_table(entries, request.taxonomy))
+    if sum(entry.counts[0] for entry in entries if entry.counts):
+        others = ", or their class is none of --classes" if request.classes else ""
+        report(f"unlabelled points are lost returns: they have no place, or lie at 0, 0, 0{others}")
     usual = request.weights.usual_uncertain_at(request.tau)
     report_certainty(entries, request.method, usual, report)
     if request.weights.weakness:
         report(f"warning: {request.weights.weakness}")
     check_faults(faults, len(entries) + len(faults))
     report(f"{counted(len(entries), 'label file')} in {out}")
-    options = [*given_options(choice), *given_options(sensor_choice)]
-    _report_next(inputs, weights, out, request.taxonomy, options)
+    if is_new:  # else the user has seen these lines
+        options = [*given_options(choice), *given_options(sensor_choice)]
+        _report_next(inputs, weights, out, request.taxonomy, options)
 
 
 def _report_next(

@@ -16,7 +16,7 @@ from amvnet.data.formats.detect import BAGS, FOLDER, GZIP, TEXT
 from amvnet.data.formats.raw import NUSCENES_ENDING, read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
-from amvnet.errors import InputError, readable
+from amvnet.errors import InputError, installation, readable
 
 EXTRAS = {"pyarrow": "feather"}  # the extra that installs a package; by default it is `formats`
 OPEN_BAGS = 4  # the number of bags that the process with limits keeps open
@@ -98,7 +98,7 @@ def check_packages(place: object, ending: str) -> None:
     if missing:
         raise InputError(
             f"{place}: expected the package {' and '.join(missing)}, found none; "
-            f'run pip install "amvnet[{EXTRAS.get(missing[0], "formats")}]"'
+            f"run {installation(EXTRAS.get(missing[0], 'formats'))}"
         )
 
 
