@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -175,7 +175,11 @@ def between(start: Camera, end: Camera, share: float) -> Camera:
         mix(start.azimuth, end.azimuth),
         mix(start.elevation, end.elevation),
         mix(start.distance, end.distance),
-        tuple(map(mix, start.target, end.target)),
+        (
+            mix(start.target[0], end.target[0]),
+            mix(start.target[1], end.target[1]),
+            mix(start.target[2], end.target[2]),
+        ),
     )
 
 
@@ -346,7 +350,7 @@ def compare(result: amvnet.Segmentation, official_labels: Path) -> Compared:
     return Compared(truth, shown_as[result.labels])
 
 
-PICTURES = {
+PICTURES: dict[str, Callable[..., None]] = {
     "viewer": viewer,
     "hard": hard,
     "map": map_of_drive,

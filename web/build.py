@@ -11,6 +11,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -138,7 +139,7 @@ def cached(name: str, sources: list[Path], make: Any) -> Path:
 
     folder = CACHE / f"{name}-{digest.hexdigest()[:16]}"
     if not folder.is_dir():
-        print(f"making {name} of the page try/, and keeping it in {CACHE.relative_to(ROOT)}")
+        print(f"making {name} of the page try/, and keeping it in {os.path.relpath(CACHE)}")
         with temporary_folder(CACHE) as unfinished:
             make(unfinished)
             try:

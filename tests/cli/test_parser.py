@@ -31,7 +31,7 @@ WRONG_NAMES = {
     "view a.bin --sensor Velodyne": "name one of hdl64e, hdl32e, vlp16, vlp32c, vls128",
     "view a.bin --sensor vpl16": "did you mean vlp16?",
     PREDICT + " --method amvnt": "did you mean amvnet?",
-    PREDICT.replace("x", "sim-hdl64"): "did you mean sim-hdl64e?",
+    "export --weights sim-hdl64 --out o": "did you mean sim-hdl64e?",
     TRAIN.replace("compact", "compct"): "did you mean simulated-compact?",
     TRAIN + " --training.rv.epoch 3": "did you mean --training.rv.epochs?",
     TRAIN + " --trainig.rv.epochs 3": "did you mean --training.rv.epochs?",

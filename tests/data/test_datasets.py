@@ -333,7 +333,7 @@ def test_opening_names_what_it_looked_for(tmp_path: Path) -> None:
     fails(lambda: open_dataset(str(tmp_path / "no")), tmp_path / "no")
     fails(lambda: open_dataset(f"nuscenes:{tmp_path / 'no'}"), tmp_path / "no")
     fails(lambda: open_dataset(str(tmp_path)), tmp_path, "neither", "velodyne", "sample_data.json")
-    fails(lambda: open_dataset(str(tmp_path)), "describe the scans in a YAML file")
+    fails(lambda: open_dataset(str(tmp_path)), "amvnet check", "YAML file")
     fails(lambda: open_dataset(f"semantickitti:{tmp_path}"), tmp_path, "velodyne")
     fails(lambda: open_dataset(f"nuscenes:{tmp_path}"), tmp_path, "v1.0-")
 
@@ -360,7 +360,7 @@ def test_a_neighbour_with_the_layout_of_a_dataset_does_not_change_the_advice(
     for name in (folder, neighbour):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / neighbour / "sample_data.json").touch()
-    fails(lambda: open_dataset(str(tmp_path / folder)), "describe the scans in a YAML file")
+    fails(lambda: open_dataset(str(tmp_path / folder)), "amvnet check", "YAML file")
 
 
 def test_a_folder_with_a_description_names_the_yaml_file(tmp_path: Path) -> None:
