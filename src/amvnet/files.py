@@ -37,6 +37,19 @@ def digest(content: str | Iterable[bytes]) -> str:
     return sha.hexdigest()[:16]
 
 
+def size_and_time(path: Path) -> tuple[int, int]:
+    """Return the bytes of a file or of a folder's files, and their last change in nanoseconds.
+
+    Both are 0 if nothing has this name.
+    """
+    try:
+        found = [file.stat() for file in (path.iterdir() if path.is_dir() else [path])]
+    except OSError:
+        found = []
+    times = (status.st_mtime_ns for status in found)
+    return sum(status.st_size for status in found), max(times, default=0)
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write a value as JSON, whole or not at all."""
     with atomic_write(path) as part:

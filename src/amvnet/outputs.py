@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.errors import InputError
+from amvnet.files import LONGEST_NAME
 
 # The format of the labels of a scan file.
 FormatName = Literal["label", "npy", "ply", "pcd", "las", "laz"]
@@ -62,6 +63,12 @@ def check_outputs(
     Raises:
         InputError: if one of the files may not be written.
     """
+    for path in outputs:
+        if len(os.fsencode(path.name)) > LONGEST_NAME:
+            raise InputError(
+                f"{path.parent}: expected a file name of at most {LONGEST_NAME} bytes, found "
+                f"{path.name[:20]}... of {len(os.fsencode(path.name))}; give a shorter one"
+            )
     existing = [path for path in outputs if os.path.lexists(path)]
     check_not_read(existing, inputs)
     for folder in {path.parent for path in outputs}:

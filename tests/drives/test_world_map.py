@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from collections import Counter, defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,12 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.drives.consensus import LEAST
 from amvnet.drives.world_map import MapBuilder
 from amvnet.errors import InputError
+from amvnet.files import alone_in, digest
 from amvnet.inference import map as mapping
+from amvnet.inference.drive import Drives, key_of
+from amvnet.inference.listing import list_inputs
+from amvnet.inference.request import LabellingRequest
+from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
 from fixtures.commands import fails, refused, run_cli, succeed
@@ -204,12 +212,60 @@ def test_a_map_that_was_stopped_is_resumed_to_the_same_map(
     out = tmp_path / "map.ply"
     assert run_cli(*command(world, out).split())[0] != 0
     assert not out.exists()
-    for other in ("--voxel 0.7", "--height 1.5", "--columns x,y,z,intensity"):
+    for other in ("--voxel 0.7", "--height 1.5", "--columns x,y,z,intensity", "--keep-own"):
         refused(command(world, out, f"--resume {other}"), "another one")
     succeed(command(world, out, "--resume"))
     assert added == 4 + SCANS - 2
     assert out.read_bytes() == (tmp_path / "whole.ply").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.ply", "whole.ply"]
+
+
+def test_a_map_is_not_resumed_if_anything_is_other_that_its_scores_depend_on(
+    world: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(world / "data", tmp_path / "data")
+    request = LabellingRequest(fresh_weights(), precision="float32")
+    scans, _ = list_inputs([f"{tmp_path}/data"])
+    drives = Drives({key_of(scan): np.eye(4) for scan in scans})
+    moved = Drives({**drives.poses, key_of(scans[3]): 2 * np.eye(4)})
+    digests = [
+        request.digest_of(scans, drives),
+        request.digest_of(scans, moved),
+        request.digest_of(scans[1:], drives),
+        replace(request, precision="bfloat16").digest_of(scans, drives),
+        replace(request, engine="onnx").digest_of(scans, drives),
+        replace(request, engine="int8").digest_of(scans, drives),
+        replace(request, sensor=Sensor(keep_own=True)).digest_of(scans, drives),
+        replace(request, weights=fresh_weights(seed=1)).digest_of(scans, drives),
+    ]
+    status = scans[4].path.stat()
+    os.utime(scans[4].path, ns=(status.st_atime_ns, status.st_mtime_ns + 1))
+    digests.append(request.digest_of(scans, drives))
+    scans[4].path.write_bytes(scans[4].path.read_bytes()[:-16])
+    os.utime(scans[4].path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    digests.append(request.digest_of(scans, drives))
+    assert len(set(digests)) == len(digests)
+    assert request.digest_of(scans, drives) == digests[-1]
+
+
+def test_a_map_is_refused_before_the_work_if_it_has_no_place_of_its_own(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mapping, "map_drive", lambda *_: pytest.fail("the work has begun"))
+    out = tmp_path / "map.ply"
+    refused(command(world, out, f"--json {tmp_path}/x/../map.ply"), "--json")
+    long = f"{'m' * 252}.ply"
+    refused(command(world, tmp_path / long), "255 bytes", "256")
+    refused(command(world, out, f"--json {tmp_path}/{long}"), "255 bytes")
+    with alone_in(tmp_path, f".{digest('map.ply')}.lock"):
+        refused(command(world, out, "--overwrite"), "another run")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_map_may_have_the_longest_name(world: Path, tmp_path: Path) -> None:
+    out = tmp_path / f"{'m' * 251}.ply"
+    succeed(command(world, out))
+    assert list(tmp_path.iterdir()) == [out]
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"PK\x03\x04", {"done": 2}, {"request": "other"}])

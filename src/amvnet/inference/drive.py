@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,12 +19,12 @@ from amvnet.data.spacing import evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit
 from amvnet.errors import InputError
+from amvnet.files import digest
 from amvnet.inference.listing import InputScan, LoadedScan, Outcome
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
 from amvnet.scan import AnyArray, Scan
-from amvnet.weights.file import Weights
 
 STANDING = -1.2  # height above which points of a normalised scan stand on the ground, metres
 # Each scan of a drive goes to the networks turned by this angle more than the scan before, radians.
@@ -68,7 +67,7 @@ class Drives:
     def digest(self) -> str:
         """A digest of all that labels depend on."""
         values = np.array(list(self.poses.values())).tobytes()
-        return f"{hashlib.sha256(values).hexdigest()[:16]}, past only: {self.past_only}"
+        return f"{digest([values])}, past only: {self.past_only}"
 
     def motion(self, scan: InputScan, loaded: LoadedScan) -> Poses:
         """Return the motion (4, 4) of a scan, normalised to the weights, into the world."""
@@ -197,18 +196,6 @@ def with_scores(
 def key_of(scan: InputScan) -> tuple[str, str]:
     """Return the recording and the name of a scan, which belong to no other scan."""
     return scan.source, scan.name
-
-
-def digest_of(
-    scans: Sequence[InputScan], drives: Drives | None, weights: Weights, *reading: object
-) -> str:
-    """Return a digest of all that the labels of some scans depend on.
-
-    `reading` decides how files are read: the sensor, the layout of their rows, the topic of bags.
-    """
-    poses = None if drives is None else drives.digest
-    request = repr((list(map(key_of, scans)), poses, weights.digests(), *reading))
-    return hashlib.sha256(request.encode()).hexdigest()[:16]
 
 
 def to_file(scan: Scan) -> Poses:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from amvnet.cli.console import on_terminal, progress, report
 from amvnet.cli.options import (
+    LabelChoice,
     LabelledChoice,
     ScanChoice,
     SensorChoice,
@@ -70,7 +71,8 @@ def adapt(
     from amvnet.data.datasets.select import to_mix_in
     from amvnet.data.datasets.simulated import SimulatedStreets
     from amvnet.data.datasets.training_data import Source, TrainingData
-    from amvnet.inference.drive import digest_of, find_poses
+    from amvnet.engines.precision import resolved
+    from amvnet.inference.drive import find_poses
     from amvnet.inference.listing import find_inputs
     from amvnet.models.methods import check_method
     from amvnet.sensors.normalise import Normaliser
@@ -87,6 +89,7 @@ def adapt(
     weights, loaded = load_for(found, weights, sensor)
     check_method("amvnet", loaded.parts)
     scans, _ = found.scans(loaded.taxonomy, Normaliser(loaded.expects, sensor, report))
+    request = LabelChoice().parse(loaded, choice, sensor_choice, resolved(compute))
     recipe = recipe_for(loaded, epochs, streets, seed)
     drives = None
     if not loose:
@@ -120,7 +123,7 @@ def adapt(
         make_segmenter,
         make_plan,
         score,
-        request=digest_of(scans, drives, loaded, sensor, options.layout, options.topic),
+        request=request.digest_of(scans, drives),
         progress=progress,
     )
     report(f"weights in {path}")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import ScanChoice, SensorChoice, load_for, load_segmenter, method_for
+from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_for, load_segmenter
 from amvnet.config.bounds import Range
 from amvnet.engines.compute import Compute
+from amvnet.errors import InputError
 from amvnet.progress import counted
 from amvnet.sensors.lidars import AUTO
 
@@ -51,14 +51,17 @@ def map(
         overwrite: replace files that exist.
     """
     from amvnet.drives.world_map import FIGURES, SIGNATURES, MapBuilder, check_ending
-    from amvnet.files import atomic_write, make_folder
-    from amvnet.inference.drive import digest_of, find_poses
+    from amvnet.engines.precision import resolved
+    from amvnet.files import alone_in, digest, write_json
+    from amvnet.inference.drive import find_poses
     from amvnet.inference.listing import find_inputs
     from amvnet.inference.map import SavedMap, describe_map, map_drive
     from amvnet.outputs import check_outputs
     from amvnet.sensors.normalise import Normaliser
 
     check_ending(out)
+    if json is not None and json.resolve() == out.resolve():
+        raise InputError(f"{out}: expected two files, found one for --out and --json; give another")
     outputs = {out: SIGNATURES[out.suffix]}
     if json is not None:
         outputs[json] = FIGURES
@@ -67,25 +70,24 @@ def map(
     weights, loaded = load_for(found, weights, sensor)
     scans, _ = found.scans(loaded.taxonomy, Normaliser(loaded.expects, sensor, report))
     files = [path for scan in scans for path in scan.files]
-    check_outputs(outputs, [*files, weights, poses], overwrite)
-    with progress("poses") as step:
-        drives = find_poses(scans, poses, progress=step, report=report, is_one=True)
-    make_folder(out.parent)
-
-    reading = (sensor, options.layout, options.topic)
-    request = f"{digest_of(scans, drives, loaded, *reading)}, {voxel:g} m"
-    saved = SavedMap(out.with_name(f".{out.name}.unfinished.npz"), request, resume)
-    builder = MapBuilder(voxel, loaded.taxonomy)
-    segmenter = load_segmenter(loaded, method_for(loaded), compute)
-    with progress("mapping") as step:
-        map_drive(scans, drives, segmenter, builder, saved, step)
-    world = builder.build(keep_movable)
-    world.write(out)
-    saved.path.unlink(missing_ok=True)
-    figures = describe_map(world, len(scans))
-    if json is not None:
-        with atomic_write(json) as part:
-            part.write_text(json_format.dumps(figures, indent=1))
+    request = LabelChoice().parse(loaded, choice, sensor_choice, resolved(compute))
+    hidden = digest(out.name)  # short, so that each name of a map has room for it
+    with alone_in(out.parent, f".{hidden}.lock"):
+        check_outputs(outputs, [*files, weights, poses], overwrite)
+        with progress("poses") as step:
+            drives = find_poses(scans, poses, progress=step, report=report, is_one=True)
+        name = f"{request.digest_of(scans, drives)}, {voxel:g} m"
+        saved = SavedMap(out.with_name(f".{hidden}.unfinished.npz"), name, resume)
+        builder = MapBuilder(voxel, loaded.taxonomy)
+        segmenter = load_segmenter(loaded, request.method, compute)
+        with progress("mapping") as step:
+            map_drive(scans, drives, segmenter, builder, saved, step)
+        world = builder.build(keep_movable)
+        world.write(out)
+        saved.path.unlink(missing_ok=True)
+        figures = describe_map(world, len(scans))
+        if json is not None:
+            write_json(json, figures)
     largest = sorted(figures["classes"].items(), key=lambda item: -item[1])[:SHOWN_CLASSES]
     shares = ", ".join(f"{count / max(len(world), 1):.0%} {name}" for name, count in largest)
     report(
