@@ -37,6 +37,7 @@ class Scan:
         name: the origin of the scan, for messages.
         to_file: (4, 4) moves points that were normalised back into the frame of their file, in
             metres; None if the points lie in this frame.
+        assumed: what was assumed of the sensor when the scan was normalised; empty if it was not.
 
     Raises:
         InputError: if the shapes do not fit each other.
@@ -50,6 +51,7 @@ class Scan:
     source: np.ndarray | None = None
     own: np.ndarray | None = None
     to_file: NDArray[np.float64] | None = None
+    assumed: str = ""
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4:

@@ -160,6 +160,22 @@ def test_a_segmenter_without_a_name_takes_the_weights_of_its_first_scan(tmp_path
     assert len([line for line in lines if line.startswith("weights ")]) == 1
 
 
+def test_each_result_has_the_assumptions_of_its_own_recording(tmp_path: Path) -> None:
+    scans = {"low": 0.9, "lower": 0.9, "tall": 1.9}
+    for folder, height in scans.items():
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / "0.npy", "vlp16", height)
+        write(tmp_path / folder / "1.npy", "vlp16", height)
+    results = list(amvnet.load("sim-hdl64e").each(f"{tmp_path}/*/*.npy"))
+    lines = [result.assumed for result in results]
+    for index, (folder, height) in enumerate(scans.items()):
+        first, second = lines[2 * index : 2 * index + 2]
+        assert first == second
+        assert first.count("assumed") == 1
+        assert first.startswith(f"{tmp_path}/{folder}/0.npy: assumed")
+        assert f"sensor {height - 0.01:.2f} m" in first
+
+
 def test_a_segmenter_without_a_name_takes_points_in_memory_as_they_are(tmp_path: Path) -> None:
     points, ring = place(LASERS["hdl32e"], 1.84)
     for given, name in (

@@ -736,7 +736,7 @@ def test_arrays_in_other_units_are_refused_or_normalised_by_the_sensor(
         result = described(given)
         assert (result.labels == expected).mean() > 0.995
         assert result.origin is not None
-        assert "over the ground" in result.origin.assumed
+        assert "over the ground" in result.assumed
 
 
 @pytest.mark.parametrize(
@@ -858,9 +858,7 @@ def test_missing_intensities_are_counted(saved: World) -> None:
         saved.segmenter(points)
     result = saved.segmenter(saved.write(points))
     assert result.origin is not None
-    assert (
-        f"no intensity in {np.isnan(points[:, 3]).sum()} of 1,500 points" in result.origin.assumed
-    )
+    assert f"no intensity in {np.isnan(points[:, 3]).sum()} of 1,500 points" in result.assumed
 
 
 def of_lost_returns(name: str) -> np.ndarray:

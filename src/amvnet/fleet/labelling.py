@@ -39,7 +39,6 @@ from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation
-from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
@@ -190,8 +189,8 @@ class MeasureSensors:
 def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     """Measure the sensor of a drive on its first scans; return its row in the table of drives."""
     source = drive[0]["drive"]
-    assumed: list[str] = []
-    reader = _make_reader(request, assumed.append)
+    assumed = ""
+    reader = _make_reader(request)
     usual = None
     # A scan that cannot be read is reported as broken when it is labelled.
     with suppress(Exception), _fetch(drive, request.layout) as (named_scans, _):
@@ -200,10 +199,10 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
         usual = reader.normaliser.measure(source).usual
         for scan, row in zip(scans, drive, strict=True):
             with suppress(InputError):  # the first scan that can be read gives the line
-                scan.load()
-                assumed = [line.replace(str(scan.path), _shown_path(row)) for line in assumed]
+                line = scan.load().scan.assumed
+                assumed = line.replace(str(scan.path), _shown_path(row))
                 break
-    return describe_drive(source, assumed[0] if assumed else "", usual)
+    return describe_drive(source, assumed, usual)
 
 
 def choose_weights(drive: Sequence[Row], sensor: Sensor, layout: RowLayout) -> tuple[str, str]:
@@ -212,8 +211,8 @@ def choose_weights(drive: Sequence[Row], sensor: Sensor, layout: RowLayout) -> t
         return Inputs([named_scans]).choose_weights(sensor)
 
 
-def _make_reader(request: LabellingRequest, report: Reporter = report_nothing) -> FileReader:
-    return FileReader(Normaliser(request.weights.expects, request.sensor, report))
+def _make_reader(request: LabellingRequest) -> FileReader:
+    return FileReader(Normaliser(request.weights.expects, request.sensor))
 
 
 @contextmanager

@@ -54,14 +54,14 @@ class ChoosingSegmenter(Segmenter):
             return super().__repr__()
         return "<Segmenter with built-in weights by the lasers of the first scan>"
 
-    def _list(self, inputs: Inputs) -> tuple[list[InputScan], list[str]]:
+    def _list(self, inputs: Inputs) -> list[InputScan]:
         if not self._choice:
             self._take(*inputs.choose_weights(self.sensor))
         return super()._list(inputs)
 
     def _read_array(
         self, points: AnyArray | Scan, columns: str | Sequence[str] | None = None
-    ) -> tuple[Scan, str]:
+    ) -> Scan:
         if not self._choice:
             if isinstance(points, Scan):
                 cloud = Cloud(points.points[:, :3], points.points[:, 3], points.ring)

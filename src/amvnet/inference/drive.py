@@ -87,9 +87,13 @@ class Drives:
         """Return a new consensus for the scans of one drive."""
         return Consensus(past_only=self.past_only)
 
+    def reach_of(self, index: int) -> slice:
+        """Return which scans of a drive the labels of the scan with an index depend on."""
+        consensus = self.consensus()
+        return slice(max(index - consensus.reach, 0), index + consensus.ahead + 1)
+
     def in_reach(self, scans: Sequence[InputScan], chosen: Sequence[InputScan]) -> list[InputScan]:
         """Return the chosen scans and all scans on which their labels depend, in order."""
-        consensus = self.consensus()
         keys = set(map(key_of, chosen))
         needed: list[InputScan] = []
         for _, drive in groupby(scans, key=lambda scan: scan.source):
@@ -97,8 +101,7 @@ class Drives:
             is_needed = np.zeros(len(members), bool)
             for index, scan in enumerate(members):
                 if key_of(scan) in keys:
-                    first = max(index - consensus.reach, 0)
-                    is_needed[first : index + consensus.ahead + 1] = True
+                    is_needed[self.reach_of(index)] = True
             needed += [scan for scan, is_in in zip(members, is_needed, strict=True) if is_in]
         return needed
 

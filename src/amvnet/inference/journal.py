@@ -20,7 +20,7 @@ class Entry(NamedTuple):
 
     Attributes:
         origin: a digest of the size and time of its file, and of the first files of its recording,
-            on which the sensor is measured.
+            on which the sensor is measured; of a drive, also of the files in reach.
         sensor: the name of the recording, whose scans have one sensor.
         uncertain: the number of uncertain points: `points` times `Segmentation.doubt`.
         counts: the number of points of each train id that was written, from 0.

@@ -167,17 +167,19 @@ class Pipeline:
     @cached_property
     def _origins(self) -> dict[str, str]:
         """The digests for `Entry.origin`, by scan."""
-        first_of: dict[str, list[Any]] = {}  # by recording
+        recordings: dict[str, list[InputScan]] = {}
         for scan in self.scans:
-            first = first_of.setdefault(scan.source, [])
-            if len(first) < MEASURED_SCANS:
-                first.append((scan.name, *_size_and_time(scan.path)))
+            recordings.setdefault(scan.source, []).append(scan)
 
         origins = {}
-        for scan in self.scans:
-            values = (_size_and_time(scan.path), first_of[scan.source])
-            digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()
-            origins[_key(scan)] = digest[:DIGEST_LENGTH]
+        for scans in recordings.values():
+            files = [(scan.name, *_size_and_time(scan.path)) for scan in scans]
+            for index, scan in enumerate(scans):
+                values: list[Any] = [files[index][1:], files[:MEASURED_SCANS]]
+                if self.drives is not None:  # the labels also depend on the scans in reach
+                    values.append(files[self.drives.reach_of(index)])
+                digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()
+                origins[_key(scan)] = digest[:DIGEST_LENGTH]
         return origins
 
     def stream(

@@ -35,7 +35,6 @@ class Origin:
             None if it is not known for this tau.
         path: the file of the scan; None if the scan was in memory.
         file_xyz: (N, 3) the unchanged coordinates of the file; None if the scan was in memory.
-        assumed: what was assumed of the scan's sensor; empty if the scan was not normalised.
     """
 
     scan: Scan
@@ -44,7 +43,6 @@ class Origin:
     usual_uncertain: float | None
     path: Path | None = None
     file_xyz: np.ndarray | None = None
-    assumed: str = ""
 
 
 @dataclass(frozen=True, repr=False)
@@ -181,7 +179,7 @@ class Segmentation:
     @property
     def assumed(self) -> str:
         """The assumptions about the sensor for normalising the scan; empty if it was in memory."""
-        return "" if self.origin is None else self.origin.assumed
+        return "" if self.origin is None else self.origin.scan.assumed
 
     def save(self, path: Path | str) -> Path:
         """Write the labels, in the format that the path's ending names; replace earlier labels.

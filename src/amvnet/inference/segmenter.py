@@ -118,8 +118,7 @@ class Segmenter:
                 "leave them out"
             )
         if not isinstance(points, Path | str):
-            scan, line = self._read_array(points, columns)
-            return self._segment([scan], [yaw], [line])[0]
+            return self._segment([self._read_array(points, columns)], [yaw])[0]
 
         if is_dataset(str(points)):
             raise InputError(
@@ -127,12 +126,12 @@ class Segmenter:
                 "Segmenter.each"
             )
         layout = parse_layout(columns or self.columns)
-        scans, assumed = self._list(find_inputs([str(points)], ScanOptions(layout=layout)))
+        scans = self._list(find_inputs([str(points)], ScanOptions(layout=layout)))
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
             )
-        return self._segment_input(scans[0], assumed, yaw)
+        return self._segment_input(scans[0], yaw)
 
     def many(
         self, scans: Sequence[AnyArray | Scan], yaws: Sequence[float] | None = None
@@ -146,40 +145,31 @@ class Segmenter:
         Raises:
             InputError: if a scan cannot be segmented; segment them one by one to see which.
         """
-        checked = []
-        lines = []
-        for points in scans:
-            scan, line = self._read_array(points)
-            checked.append(scan)
-            lines.append(line)
-        return self._segment(checked, yaws, lines)
+        return self._segment([self._read_array(points) for points in scans], yaws)
 
     def _read_array(
         self, points: AnyArray | Scan, columns: str | Sequence[str] | None = None
-    ) -> tuple[Scan, str]:
-        """Return the scan of an array, and what was assumed of its sensor if it is described."""
-        if not isinstance(points, Scan):
-            cloud = array_cloud(points, columns or self.columns)
-            if self.sensor.is_known:
-                normaliser, assumed = self._normaliser()
-                return normaliser(cloud, "scan"), assumed[0]
-            scan = array_scan(cloud, self.weights.expects.intensity)
-            return mark_own(scan, self.sensor), ""
-        return check_scan(points), ""
+    ) -> Scan:
+        """Return the scan of an array, normalised to the weights if its sensor is described."""
+        if isinstance(points, Scan):
+            return check_scan(points)
+        cloud = array_cloud(points, columns or self.columns)
+        if self.sensor.is_known:
+            return self._normaliser()(cloud, "scan")
+        scan = array_scan(cloud, self.weights.expects.intensity)
+        return mark_own(scan, self.sensor)
 
-    def _segment(
-        self, scans: Sequence[Scan], yaws: Sequence[float] | None, assumed: Sequence[str]
-    ) -> list[Segmentation]:
-        """Segment scans, each with a valid point and what was assumed of it, in one pass."""
+    def _segment(self, scans: Sequence[Scan], yaws: Sequence[float] | None) -> list[Segmentation]:
+        """Segment scans, each with a valid point, in one pass."""
         is_large = sum(map(len, scans)) >= LARGE_BATCH
         with return_freed_memory() if is_large else nullcontext():
             batch = self.batch(scans, yaws)
             labels, scores = fetch(self.engine.score(batch))
 
         results = []
-        for scan, points, line in zip(scans, batch.slices(), assumed, strict=True):
+        for scan, points in zip(scans, batch.slices(), strict=True):
             result = unpack(scan.valid, labels, scores, points)
-            origin = Origin(scan, self.taxonomy, self.method, self.usual_uncertain, assumed=line)
+            origin = Origin(scan, self.taxonomy, self.method, self.usual_uncertain)
             results.append(replace(result, origin=origin))
         return results
 
@@ -201,29 +191,22 @@ class Segmenter:
                 segmented.
         """
         options = ScanOptions(topic=topic, layout=parse_layout(self.columns))
-        scans, assumed = self._list(find_inputs([str(path)], options))
-        return (self._segment_input(scan, assumed) for scan in scans)
+        return map(self._segment_input, self._list(find_inputs([str(path)], options)))
 
-    def _list(self, inputs: Inputs) -> tuple[list[InputScan], list[str]]:
-        """Return the scans of some inputs, and the list of what is assumed of their sensors."""
-        normaliser, assumed = self._normaliser()
-        scans, _ = inputs.scans(self.taxonomy, normaliser)
-        return scans, assumed
+    def _list(self, inputs: Inputs) -> list[InputScan]:
+        """Return the scans of some inputs, normalised to the weights when they are read."""
+        return inputs.scans(self.taxonomy, self._normaliser())[0]
 
-    def _normaliser(self) -> tuple[Normaliser, list[str]]:
-        """Return a normaliser, and the list of what it assumes of the sensors of the scans."""
-        assumed: list[str] = []
-        return Normaliser(self.weights.expects, self.sensor, assumed.append), assumed
+    def _normaliser(self) -> Normaliser:
+        return Normaliser(self.weights.expects, self.sensor)
 
-    def _segment_input(self, scan: InputScan, assumed: list[str], yaw: float = 0.0) -> Segmentation:
-        """Read and segment one of the scans for which a normaliser has `assumed` something."""
+    def _segment_input(self, scan: InputScan, yaw: float = 0.0) -> Segmentation:
+        """Read and segment a scan."""
         loaded = scan.load(labels=True)
         result = self(loaded.scan, yaw=yaw)
 
         assert result.origin is not None
-        origin = replace(
-            result.origin, path=scan.path, file_xyz=loaded.file_xyz, assumed="; ".join(assumed)
-        )
+        origin = replace(result.origin, path=scan.path, file_xyz=loaded.file_xyz)
         return replace(result, origin=origin)
 
     def batch(self, scans: Sequence[Scan], yaws: Sequence[float] | None = None) -> PointBatch:

@@ -106,9 +106,8 @@ class Normaliser:
         expected: the scans that the weights expect. If it is None, scans are only turned by the
             description of the sensor, so that people can look at them.
         sensor: what is known about the scans' sensor; the rest is measured.
-        report: called with one line on what was assumed, once for all recordings of one sensor, and
-            once more if a recording has scans from other sensors; and with a line on what is known
-            about the sensor and contradicts the scans.
+        report: called with `Scan.assumed`, once for all recordings of one sensor, and once more if
+            a recording has scans from other sensors.
     """
 
     def __init__(
@@ -122,7 +121,8 @@ class Normaliser:
         self._report = report
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
-        self._reported: set[str] = set()  # recordings whose line was reported, and such lines
+        self._assumed: dict[str, str] = {}  # the lines by recording, and by its other sensors
+        self._turned: set[str] = set()  # what was reported of scans that are only turned
         self._described: list[tuple[str, Estimate]] = []  # notes and estimates in these lines
 
     def quiet(self) -> None:
@@ -154,21 +154,23 @@ class Normaliser:
         scan, ring_fault = normalise(cloud, estimate, self.sensor, self.expected)
 
         title = source if is_usual else f"{source}, other sensors"
-        is_new = title not in self._reported
+        is_new = title not in self._assumed
         if is_new or recording.is_mixed:
-            self._reported.add(title)
             line = describe(cloud, estimate, self.sensor, self.expected, ring_fault)
             if recording.is_mixed:
                 line += f"; {source} has scans of other sensors, so that each is measured alone"
             if not is_usual:
                 line += f"; another sensor or scale of intensity than {source} begins with"
+            lines = [line]
+            stated = estimate.contradiction(self.sensor)
+            if stated:
+                lines.append(f"warning: {cloud.name}: you state {stated}; correct the sensor")
+            self._assumed[title] = "; ".join(lines)
             is_described = self._is_described(cloud, estimate)
             if (is_new and (not is_usual or recording.is_mixed)) or not is_described:
-                self._report(line)
-                stated = estimate.contradiction(self.sensor)
-                if stated:
-                    self._report(f"warning: {cloud.name}: you state {stated}; correct the sensor")
-        return scan
+                for line in lines:
+                    self._report(line)
+        return dataclasses.replace(scan, assumed=self._assumed[title])
 
     def _is_described(self, cloud: Cloud, estimate: Estimate) -> bool:
         for note, other in self._described:
@@ -233,18 +235,20 @@ class Normaliser:
         xyz = self.sensor.to_level(cloud.xyz)
         scale = self.sensor.intensity_scale or cloud.intensity_scale()
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
-        scan = dataclasses.replace(scan, to_file=self.sensor.to_file())
 
-        if source not in self._reported:
+        if source not in self._assumed:
             has_intensity = cloud.intensity is not None and scale is not None
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
             negative = _describe_negative(cloud)
             parts = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
             assumed = ", ".join(filter(None, parts))
-            if assumed not in self._reported:
+            if assumed not in self._turned:
                 self._report(f"{cloud.name}: assumed {assumed}")
-            self._reported |= {source, assumed}
-        return scan
+            self._turned.add(assumed)
+            self._assumed[source] = f"{cloud.name}: assumed {assumed}"
+        return dataclasses.replace(
+            scan, to_file=self.sensor.to_file(), assumed=self._assumed[source]
+        )
 
 
 def normalised(
