@@ -38,7 +38,7 @@ from amvnet.sensors import normalise as normalising
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.laser_order import lasers_by_order
-from amvnet.sensors.lidars import rotation_from_degrees
+from amvnet.sensors.lidars import ANY, rotation_from_degrees
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights import verdict
 from amvnet.weights.file import load
@@ -579,6 +579,13 @@ UNKNOWN_SENSORS: dict[str, dict[str, Any]] = {
 }
 for name, (what, sensor) in product(("raised_12_6", "of_fewer_lasers"), UNKNOWN_SENSORS.items()):
     MAKERS[f"{name}_{what}"] = partial(for_another_sensor, MAKERS[name], sensor)
+FOR_ANY_SENSOR = (
+    *("kitti_like", "in_another_order", "higher_with_lost_returns", "of_another_sensor"),
+    *("of_fewer_lasers", "tilted", "raised_12_6", "of_one_elevation", "near_points_alone"),
+    *("of_16_points", "of_1_point"),
+)
+for name in FOR_ANY_SENSOR:
+    MAKERS[f"{name}_for_any_sensor"] = partial(for_another_sensor, MAKERS[name], {"name": ANY})
 WITH_VIEWS = ("kitti_like", "nuscenes_like", "higher_with_lost_returns", "coincident")
 Made = tuple[Case, dict[str, Any]]  # a scan, and what the page makes of it
 

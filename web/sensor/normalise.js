@@ -5,7 +5,7 @@ import { isPlaced } from "../reading/cloud.js";
 import { findFrame, isOnGround, risesOf, tilted, toLevel, UNITS } from "./frame.js";
 import { NEAREST } from "./ground.js";
 import { fillIntensity, intensityMap, matchIntensity, missingText, negativeText } from "./intensity.js";
-import { elevationOf, hasEndsOf, orderRings, rowsOf } from "./rows.js";
+import { ANY, elevationOf, hasEndsOf, orderRings, rowsOf } from "./rows.js";
 import { quantilesOf } from "./statistics.js";
 
 const FARTHEST = 10_000;  // the limit of coordinates, metres; no LiDAR sees so far
@@ -138,6 +138,7 @@ function lasersText({ beams, fov_up: top, fov_down: bottom }) {
 
 /** Return whether lasers are like those of a sensor; null if its field of view is not known. */
 function isLikeOf(lasers, sensor) {
+  if (sensor.name === ANY) return true;
   if (sensor.fov_up === null || sensor.fov_down === null) return null;
   const ratio = lasers.beams && sensor.beams ? lasers.beams / sensor.beams : 1;
   return ratio > 1 / SAME_BEAMS && ratio < SAME_BEAMS && hasEndsOf(lasers, sensor);

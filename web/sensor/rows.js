@@ -11,10 +11,21 @@ const MAX_RING_SPREAD = 0.2;  // the largest variance of the elevations within t
 const LEAST_RING_POINTS = 10;  // the least number of points of a ring whose elevation counts
 const SAME_ELEVATION = 0.1;  // rings that descend by less than this are in order, degrees
 const LEAST_POINTS = 64;  // the least mean number of points of a laser; fewer do not show an order
+const LEAST_MEASURED = 100;  // the least number of points on which a sensor is measured
+const BINS = 360;  // bins of elevation in which lasers are counted, from -90 to +90 degrees
+const BIN = 180 / BINS;  // the height of a bin, degrees
+const SECTORS = 180;  // sectors of azimuth in which the points of a bin are counted
+const AROUND = 3;  // the number of bins to each side that are counted together
+export const ANY = "any";  // the name of the sensor of weights whose training has shown sensors of all kinds
 
 /** Return the elevation of a point, degrees above the horizon. */
 export function elevationOf(x, y, z) {
   return (Math.atan2(z, Math.sqrt(x * x + y * y)) * 180) / Math.PI;
+}
+
+/** Return the elevations (n) of points (4 n), degrees above the horizon. */
+function elevationsOf(points) {
+  return Float64Array.from({ length: points.length / 4 }, (_, i) => elevationOf(...points.subarray(4 * i, 4 * i + 3)));
 }
 
 /** Return the row of an elevation in a view; row 0 is the highest. */
@@ -37,7 +48,8 @@ export function rowsOf(points, tilted, ring, lasers, { view, sensor, as_is: isAs
     if (highest >= LASERS_SEEN * view.height && highest < view.height) return byLaser(each);
   }
 
-  const elevations = Float64Array.from({ length: points.length / 4 }, (_, i) => elevationOf(...points.subarray(4 * i, 4 * i + 3)));
+  const elevations = elevationsOf(points), density = sensor.name === ANY ? densityOf(points) : null;
+  if (density) return rowsByDensity(elevations, density, view.height);
   const byElevation = viewByElevation(elevations, lasers, { view, sensor, isAsIs });
   const rings = view.rows === "ring" ? byLaser(ring) : null;
   // Lasers that no data sheet describes need not be evenly spaced.
@@ -46,6 +58,57 @@ export function rowsOf(points, tilted, ring, lasers, { view, sensor, as_is: isAs
   const rows = Int32Array.from(elevations, (elevation) => rowAt(elevation, byElevation));
   const offs = rings && rows.map((row, i) => Math.abs(row - rings[i])).sort();
   return rings && quantilesOf(offs, [0.5])[0] < 1 ? rings : rows;
+}
+
+/**
+ * Return how close together the lasers of a scan are (BINS); null if its points do not show it.
+ *
+ * This is the mean number of points around a bin in the sectors that have any there. Where lasers see the sky, sectors are
+ * empty and do not count.
+ */
+function densityOf(points) {
+  const distant = points.filter((_, i) => Math.hypot(...points.subarray(i - (i % 4), i - (i % 4) + 2)) > NEAREST);
+  const elevations = elevationsOf(distant);
+  if (elevations.length < LEAST_MEASURED) return null;
+  const counts = new Int32Array((BINS + 2 * AROUND) * SECTORS);
+  elevations.forEach((elevation, i) => {
+    const [x, y] = distant.subarray(4 * i, 4 * i + 2), turn = Math.atan2(y, x) / (2 * Math.PI) + 0.5;
+    const sector = Math.min(Math.floor(turn * SECTORS), SECTORS - 1);
+    counts[(AROUND + binOf(elevation)) * SECTORS + sector] += 1;
+  });
+
+  const [bottom, top] = quantilesOf(elevations.sort(), [0.005, 0.995]);
+  const density = Float64Array.from({ length: BINS }, (_, bin) => {
+    if (edgeOf(bin + 1) <= bottom || edgeOf(bin) >= top) return 0;
+    let total = 0, filled = 0;
+    for (let sector = 0; sector < SECTORS; sector++) {
+      let here = 0;
+      for (let near = bin; near <= bin + 2 * AROUND; near++) here += counts[near * SECTORS + sector];
+      total += here;
+      filled += here > 0;
+    }
+    return total / Math.max(filled, 1);
+  });
+  return density.some(Boolean) ? density : null;
+}
+
+/** Return the row of each elevation, so that each row has about equally many lasers. */
+function rowsByDensity(elevations, density, height) {
+  const below = [0];
+  for (const value of density) below.push(below.at(-1) + value);
+  return Int32Array.from(elevations, (elevation) => {
+    const bin = binOf(elevation), share = below[bin] + (density[bin] / BIN) * (elevation - edgeOf(bin));
+    return Math.min(Math.max(Math.floor((1 - share / below.at(-1)) * height), 0), height - 1);
+  });
+}
+
+/** Return the lower end of a bin, degrees. */
+function edgeOf(bin) {
+  return bin * BIN - 90;
+}
+
+function binOf(elevation) {
+  return Math.min(Math.floor((elevation + 90) / BIN), BINS - 1);
 }
 
 /**
