@@ -114,6 +114,27 @@ def test_tf_takes_the_chain_up_to_the_frame_without_a_parent(tmp_path: Path, sto
         np.testing.assert_allclose(pose, expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("stamps", [[FIRST], [0.0], [FIRST + 0.2, FIRST + 0.3], []])
+def test_transforms_within_the_robot_may_come_on_tf(tmp_path: Path, stamps: list[float]) -> None:
+    """They may come once, with any stamp, or again and again, also beside odometry."""
+    times, poses = shaken(0)
+    moving = list(zip(times, poses, strict=True))
+    sent = [transform(time, pose, ("odom", "base_link"), "/tf") for time, pose in moving]
+    sent += [odometry(time, pose, frames=("odom", "base_link")) for time, pose in moving]
+    sent += [
+        transform(stamp, pose, frames, "/tf")
+        for stamp in stamps or times
+        for pose, frames in ((ON_MOUNT, ("mount", "lidar")), (ON_BASE, ("base_link", "mount")))
+    ]
+    bag = write_bag(tmp_path / "drive", [*sent, *CLOUDS])
+    lines: list[str] = []
+    for topic in ["/odom"] if len(stamps) == 2 else ["/odom", "/tf"]:
+        for pose, time in zip(poses_of(bag, topic, lines), TIMES, strict=True):
+            expected = between(times, poses, time) @ ON_BASE @ ON_MOUNT
+            np.testing.assert_allclose(pose, expected, atol=1e-4)
+    assert not lines
+
+
 @pytest.mark.parametrize("kind", [ODOMETRY, POSE, POSE_WITH_COVARIANCE])
 def test_without_a_static_transform_poses_are_the_lidars(tmp_path: Path, kind: str) -> None:
     times, poses = shaken(0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,8 @@ POSE_TYPES = (
     *("geometry_msgs/msg/PoseWithCovarianceStamped", *TF_TYPES),
 )
 LONGEST_CHAIN = 100  # largest number of frames above each other that count
-STATIC = "tf_static"  # the end of the names of topics with transforms that do not change
+# The kinds of poses; the first one is the end of the names of topics whose transforms are fixed.
+STATIC, TF, GIVEN = "tf_static", "tf", "given"
 
 
 @dataclass(frozen=True)
@@ -99,13 +100,26 @@ class BagPoses:
 
 @dataclass(frozen=True)
 class _Transform:
-    """The poses of a frame in its parent, as rows (M, 8) of time x y z qx qy qz qw."""
+    """The poses of a frame in its parent, as rows (M, 8) of time x y z qx qy qz qw.
+
+    `kind` is STATIC or TF for transforms, or GIVEN for the poses of a topic.
+    """
 
     name: str
     parent: str
     child: str
+    kind: str
     rows: NDArray[np.float64]
-    is_fixed: bool
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether it does not change: by its topic, or because /tf has it at a single time."""
+        return self.kind == STATIC or (self.kind == TF and not np.ptp(self.rows[:, 0]))
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it is a transform, not a pose, that is always the same."""
+        return self.kind != GIVEN and not np.ptp(self.rows[:, 1:], axis=0).any()
 
     def at(self, times: NDArray[np.float64]) -> Poses:
         """Return the pose at each time (N, 4, 4), or the only one (1, 4, 4) if it is fixed."""
@@ -122,9 +136,9 @@ def _transforms(name: str, found: Mapping[str, Any]) -> list[_Transform]:
     ends = np.cumsum(np.bincount(found["edges"], minlength=len(found["frames"])))
     transforms = []
     rows_of_each = np.split(found["rows"][order], ends[:-1])
-    for (parent, child, is_fixed), rows in zip(found["frames"], rows_of_each, strict=False):
+    for (parent, child, kind), rows in zip(found["frames"], rows_of_each, strict=False):
         label = f"{name}, {shown(child)} in {shown(parent)}"
-        transforms.append(_Transform(label, parent, child, rows, is_fixed))
+        transforms.append(_Transform(label, parent, child, kind, rows))
     return transforms
 
 
@@ -151,8 +165,9 @@ def _by_odometry(
     report: Reporter,
 ) -> Poses:
     """Return the poses (N, 4, 4) of a frame that is fixed to the frame with odometry."""
-    fixed = [item for item in transforms if item.is_fixed]
-    moving = [item for item in transforms if not item.is_fixed]
+    # Drivers also send transforms within the robot on /tf, again and again.
+    fixed = [replace(item, kind=STATIC) for item in transforms if item.is_constant]
+    moving = [item for item in transforms if item.kind == GIVEN]
     if len(moving) != 1:
         pairs = ", ".join(f"{shown(item.child)} in {shown(item.parent)}" for item in moving[:3])
         raise InputError(
@@ -167,7 +182,7 @@ def _by_odometry(
     common = next((above for above in of_lidar if above in of_child), None)
     if common is None:
         report(
-            f"{name}: assumed that its poses are the LiDAR's: no static transform leads from "
+            f"{name}: assumed that its poses are the LiDAR's: no fixed transform leads from "
             f"{shown(odometry.child)} to the scans' frame {shown(frame)}"
         )
         return poses
@@ -205,23 +220,26 @@ def pose_topics(path: Path, ending: str) -> dict[str, dict[str, str]]:
 
 
 def read_transforms(path: Path, ending: str, scan_topic: str | None, topic: str) -> dict[str, Any]:
-    """Return the scans' times (N,) and frame, and all poses of a topic and static transforms.
+    """Return the scans' times (N,) and frame, and all poses of a topic and transforms beside them.
 
-    Each of the `rows` (M, 8) of time x y z qx qy qz qw belongs to one of the `edges` (M,), indices
-    into the `frames`: parent, child, and whether the transform is static.
+    Beside tf, these are the static ones; beside a topic of poses, all. Each of the `rows` (M, 8) of
+    time x y z qx qy qz qw belongs to one of the `edges` (M,), indices into the `frames`: parent,
+    child, and its kind.
     """
     times, frame = Bag(path, ending, scan_topic).headers()
     deserialise = deserialiser(ending == ".bag")
-    frames: dict[tuple[str, str, bool], int] = {}
+    frames: dict[tuple[str, str, str], int] = {}
     edges = array("q")
     rows = array("d")
     with reading(f"{path} ({topic})", EXPECTED, ADVICE), closing(open_reader(path, ending)) as bag:
         connections = _with_poses(bag.connections)
-        chosen = [each for each in connections if each.topic == topic or _is_static(each)]
+        kinds = {each.topic: _kind_of(each) for each in connections}
+        beside = (STATIC, TF) if kinds[topic] == GIVEN else (STATIC,)
+        chosen = [each for each in connections if each.topic == topic or _kind_of(each) in beside]
         for connection, _, data in bag.messages(connections=chosen):
             kind = TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
             for parent, child, *row in _poses_of(deserialise(data, kind)):
-                key = (parent.strip("/"), child.strip("/"), _is_static(connection))
+                key = (parent.strip("/"), child.strip("/"), kinds[connection.topic])
                 edges.append(frames.setdefault(key, len(frames)))
                 rows.extend(row)
     return {
@@ -237,8 +255,10 @@ def _with_poses(connections: Iterable[Any]) -> list[Any]:
     return [connection for connection in connections if connection.msgtype in POSE_TYPES]
 
 
-def _is_static(connection: Any) -> bool:
-    return connection.msgtype in TF_TYPES and connection.topic.endswith(STATIC)
+def _kind_of(connection: Any) -> str:
+    if connection.msgtype not in TF_TYPES:
+        return GIVEN
+    return STATIC if connection.topic.endswith(STATIC) else TF
 
 
 def _poses_of(message: Any) -> Iterator[tuple[Any, ...]]:
