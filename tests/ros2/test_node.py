@@ -24,11 +24,21 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.drives.consensus import REACH, _Seen
 from amvnet.engines.torch import TorchEngine
 from amvnet.inference.segmentation import Segmentation
+from amvnet.scan import Scan
 from amvnet_ros.fusion import PastFusion
 from amvnet_ros.messages import Message
 
-from fixtures.bag_poses import drive_clouds, drive_odometry, pose_at, write_bag
+from fixtures.bag_poses import (
+    FIRST,
+    PERIOD,
+    cloud,
+    drive_clouds,
+    drive_odometry,
+    pose_at,
+    write_bag,
+)
 from fixtures.commands import succeed
+from fixtures.drives import drive_scans
 from fixtures.processes import PATIENCE
 from fixtures.ros import STORE, install, over_the_wire
 from fixtures.scan_writers import cloud_message, write_bag2
@@ -384,6 +394,26 @@ def test_scans_are_fused_with_past_scans_as_by_predict_on_a_bag(
     assert any((a != b).any() for a, b in zip(labels_of(node), alone_labels, strict=True))
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000), ("ft", 1 / 0.3048)])
+def test_scans_in_another_unit_are_fused_as_those_in_metres(
+    start: Callable[..., Any], drive: Drive, unit: str, factor: float
+) -> None:
+    scale = np.array([factor, factor, factor, 1], np.float32)
+    messages = []
+    for index, (points, _) in enumerate(drive_scans(DRIVE_SCANS)):
+        message = cloud(FIRST + PERIOD * index, points * scale).make(STORE)
+        message.data = array("B", message.data.tobytes())
+        messages.append(message)
+    found = []
+    for sent, stated in ((messages, unit), (drive.messages, "m")):
+        node = start(**{**SENSOR, "odom_frame": "odom", "unit": stated})
+        node._frames.poses |= drive.poses
+        found.append(np.concatenate(label_all(node, sent)))
+    assert np.mean(found[0] == found[1]) > 0.99
+    alone_labels = np.concatenate(alone(start, drive.messages))
+    assert np.mean(found[0] == alone_labels) < 0.9
+
+
 def test_odometry_that_comes_while_a_scan_is_labelled_counts(
     start: Callable[..., Any], drive: Drive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -491,7 +521,8 @@ def test_only_scans_in_reach_are_in_memory() -> None:
     for stamp in range(3 * REACH):
         scores = rng.dirichlet(np.ones(4), 50).astype(np.float32)
         result = Segmentation(np.ones(50, np.uint8), np.zeros(50, bool), scores)
-        fuse(Message(stamp, "lidar"), rng.normal(0, 5, (50, 3)), result)
+        scan = Scan(rng.normal(0, 5, (50, 4)).astype(np.float32))
+        fuse(Message(stamp, "lidar"), scan, result)
     assert scans_in_memory() <= before + REACH + 2
 
 

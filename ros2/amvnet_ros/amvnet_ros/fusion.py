@@ -14,10 +14,11 @@ from amvnet_ros.messages import NANOSECONDS, Message
 if TYPE_CHECKING:  # the node sets the environment before torch reads it
     from amvnet.drives.consensus import DriveScan, Fused
     from amvnet.inference.segmentation import Segmentation
+    from amvnet.scan import Scan
 
 FASTEST = 70.0  # a larger speed is a jump of the odometry, metres per second
 
-Pose = NDArray[np.float64]  # (4, 4) moves points of a cloud into the world, metres
+Pose = NDArray[np.float64]  # (4, 4) moves points of a cloud in metres into the world
 FindPose = Callable[[Message, bool], Pose | None]
 
 
@@ -46,18 +47,16 @@ class PastFusion:
 
         return 0.0 if origin.stamp < self._stamp else self._count * TURN
 
-    def __call__(
-        self, origin: Message, xyz: NDArray[np.floating], result: Segmentation
-    ) -> Segmentation:
+    def __call__(self, origin: Message, scan: Scan, result: Segmentation) -> Segmentation:
         """Return a result with the consensus as labels and scores.
 
         Args:
             origin: the stamp and the frame of the scan.
-            xyz: (N, 3) the points of the message, metres.
+            scan: the points of the message, normalised to the weights, in metres.
             result: the result for the scan alone.
         """
         from amvnet.drives.consensus import Consensus, DriveScan
-        from amvnet.inference.drive import with_scores
+        from amvnet.inference.drive import to_file, with_scores
 
         is_back = origin.stamp < self._stamp
         self._stamp = origin.stamp
@@ -72,7 +71,8 @@ class PastFusion:
         self._last = (origin.stamp, pose)
         if self._fused is None:  # of past scans alone, each scan comes back at once
             self._fused = Consensus(past_only=True).stream(iter(self._waiting.popleft, None))
-        self._waiting.append(DriveScan(None, xyz, result.scores, pose))
+        motion = pose @ to_file(scan)
+        self._waiting.append(DriveScan(None, scan.points[:, :3], result.scores, motion))
         return with_scores(result, next(self._fused).scores)
 
     def _jumps(self, pose: Pose) -> bool:

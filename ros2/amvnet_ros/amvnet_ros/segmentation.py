@@ -168,7 +168,7 @@ class CloudSegmenter:
         scan = self._normalise(cloud, self._topic)
         result = self._segment(scan, yaw=0.0 if self._fuse is None else self._fuse.yaw(origin))
         if self._fuse is not None:  # last, because odometry often comes after its scan
-            result = self._fuse(origin, cloud.xyz, result)
+            result = self._fuse(origin, scan, result)
         points = LabelledPoints(
             cloud.xyz,
             raw=self.taxonomy.to_raw(result.labels),
