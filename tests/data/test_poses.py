@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.poses import read_poses
+from amvnet.data.poses import read_poses, times_of
 
 from fixtures.commands import fails
 from fixtures.drives import TO_CAMERA, drive_poses, write_drive
@@ -53,6 +54,52 @@ def test_every_format_gives_the_same_poses(tmp_path: Path, write: Callable[[Path
     np.testing.assert_allclose(read_poses(path).at(None, len(POSES)), POSES, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace(" ", ","),
+        lambda text: text.replace(" ", ", "),
+        lambda text: "time, x, y, z, qx, qy, qz, qw\n" + text,
+    ],
+)
+def test_a_bom_commas_and_names_of_columns_change_nothing(
+    tmp_path: Path, spoil: Callable[[str], str]
+) -> None:
+    path = write_tum(tmp_path / "tum.txt")
+    lines = path.read_text().splitlines()[1:]
+    path.write_text(spoil("\n".join(lines)), encoding="utf-8")
+    np.testing.assert_allclose(read_poses(path).poses, POSES, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["poses.npz", "poses.npy"])
+def test_an_archive_of_one_array_is_that_array(tmp_path: Path, name: str) -> None:
+    np.savez(tmp_path / "any.npz", poses=POSES)
+    path = (tmp_path / "any.npz").rename(tmp_path / name)
+    np.testing.assert_array_equal(read_poses(path).poses, POSES)
+    np.savez(tmp_path / "any.npz", poses=POSES, times=POSES)
+    (tmp_path / "any.npz").rename(path)
+    fails(lambda: read_poses(path), name, "times")
+
+
+def test_a_header_of_more_poses_than_the_file_holds_is_one_line(tmp_path: Path) -> None:
+    path = write_numpy(tmp_path / "poses")
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"(24, 4, 4), }" + b" " * 9, b"(10000000000, 4, 4), }"))
+    assert path.read_bytes() != content
+    fails(lambda: read_poses(path), "poses.npy", "10000000000")
+
+
+@pytest.mark.parametrize("name", ["foo", "-1", "24", "1.5", "+3"])
+def test_a_scan_whose_name_is_no_number_of_a_pose_is_one_line(tmp_path: Path, name: str) -> None:
+    dataset = open_dataset(str(write_drive(tmp_path)))
+    folder = tmp_path / "sequences/00"
+    for kind, ending in (("velodyne", "bin"), ("labels", "label")):
+        shutil.copy(folder / kind / f"000000.{ending}", folder / kind / f"{name}.{ending}")
+    records = dataset.records(["00"])
+    fails(lambda: dataset.poses(records), "poses.txt", f"the scan {name}", "24 poses")
+
+
 def test_a_calibration_turns_no_other_format(tmp_path: Path) -> None:
     (tmp_path / "calib.txt").write_text(f"Tr: {' '.join(map(str, TO_CAMERA[:3].ravel()))}\n")
     path = write_numpy(tmp_path / "poses")
@@ -65,6 +112,11 @@ def test_poses_of_the_camera_become_poses_of_the_lidar(tmp_path: Path) -> None:
     poses = dataset.poses(records)
     assert poses is not None
     np.testing.assert_allclose(poses, drive_poses(), atol=1e-9)
+    file = tmp_path / "sequences/00/poses.txt"
+    assert "turned from the camera by calib.txt" in read_poses(file).note
+    (tmp_path / "sequences/00/calib.txt").rename(tmp_path / "calib.txt")
+    assert "as the LiDAR's, without calib.txt" in read_poses(file).note
+    (tmp_path / "calib.txt").rename(tmp_path / "sequences/00/calib.txt")
 
     # The number of a scan is the line of its pose.
     some = dataset.poses(records[3:5])
@@ -145,7 +197,26 @@ def test_a_single_pose_is_no_drive(tmp_path: Path) -> None:
 
 def test_times_that_do_not_overlap_are_one_line(tmp_path: Path) -> None:
     file = read_poses(write_tum(tmp_path / "tum.txt"))
-    fails(lambda: file.at([5.0, 5.1], 2), "tum.txt", "5.00 to 5.10", "100.00 to 102.30")
+    words = ("tum.txt", "5.00 to 5.10", "100.00 to 102.30", "by the same clock")
+    fails(lambda: file.at([5.0, 5.1], 2), *words)
+
+
+@pytest.mark.parametrize("scans", ["s", "ms", "us", "ns"])
+@pytest.mark.parametrize("poses", ["s", "ms", "us", "ns"])
+def test_times_in_other_units_are_one_line_that_says_so(
+    tmp_path: Path, scans: str, poses: str
+) -> None:
+    powers = {"s": 0, "ms": 3, "us": 6, "ns": 9}
+    first = 1_700_000_000
+    file = read_poses(write_tum(tmp_path / "tum.txt", first=first))
+    assert file.times is not None
+    file = replace(file, times=file.times * 10 ** powers[poses])
+    names = [str((first + second) * 10 ** powers[scans]) for second in (1, 2)]
+    times = times_of(names)
+    if (poses, scans) in (("s", "s"), ("s", "ns"), ("ms", "ms")):
+        assert len(file.at(times, 2)) == 2
+    else:
+        fails(lambda: file.at(times, 2), "tum.txt", "unit", "in seconds")
 
 
 @pytest.mark.parametrize("write", [write_kitti, write_tum])
@@ -200,7 +271,9 @@ def test_no_poses_are_one_line(tmp_path: Path) -> None:
 def test_equal_times_are_one_line(tmp_path: Path) -> None:
     path = tmp_path / "tum.txt"
     path.write_text("1 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
-    fails(lambda: read_poses(path), "ascending times")
+    fails(lambda: read_poses(path), "ascending times", "1 s twice", "pose 1", "remove one")
+    path.write_text("1 0 0 0 0 0 0 1\n0 1 0 0 0 0 0 1\n")
+    fails(lambda: read_poses(path), "0 s late", "sort them")
 
 
 def test_angles_in_place_of_quaternions_are_one_line(tmp_path: Path) -> None:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from amvnet.drives.odometry import Pair, check_fit
+from amvnet.drives.odometry import Pair, check_fit, check_steps
 
 from fixtures.commands import fails
+from fixtures.drives import drive_poses
+
+NAMED = ("poses", "advice")  # the beginning and the end of a message
 
 
 def posts(count: int = 600, seed: int = 0) -> np.ndarray:
@@ -36,10 +41,13 @@ def test_the_message_names_the_motion_that_fits_better(
     factor: float, words: str, motion: dict[str, float]
 ) -> None:
     after = moved_back(posts(), motion_of(**motion))
-    check_fit([Pair(posts(), after, motion_of(**motion))], "poses")
+    check_fit([Pair(posts(), after, motion_of(**motion))], *NAMED)
     wrong = motion_of(**{name: factor * value for name, value in motion.items()})
-    fails(lambda: check_fit([Pair(posts(), after, wrong)], "poses"), f"motions {words} as long")
-    fails(lambda: check_fit([Pair(posts(), posts(), wrong)], "poses"), "no motion")
+    fails(
+        lambda: check_fit([Pair(posts(), after, wrong)], *NAMED),
+        f"motions {words} as long",
+    )
+    fails(lambda: check_fit([Pair(posts(), posts(), wrong)], *NAMED), "no motion")
 
 
 def test_a_few_other_points_and_a_few_other_pairs_change_nothing() -> None:
@@ -48,7 +56,7 @@ def test_a_few_other_points_and_a_few_other_pairs_change_nothing() -> None:
     after[:20] += 7  # the first points, of a car that overtakes
     pair = Pair(posts(), after, motion)
     other = Pair(posts(), posts(seed=1), motion)
-    check_fit([pair, other, pair], "poses")
+    check_fit([pair, other, pair], *NAMED)
 
 
 def test_points_on_the_car_and_far_away_are_not_compared() -> None:
@@ -60,10 +68,48 @@ def test_points_on_the_car_and_far_away_are_not_compared() -> None:
         np.concatenate([points, own, rng.uniform(40, 400, (2000, 3))])
         for points in (posts(), moved_back(posts(), motion))
     )
-    check_fit([Pair(before, after, motion)], "poses")
+    check_fit([Pair(before, after, motion)], *NAMED)
+
+
+def test_a_single_pose_off_the_way_is_named() -> None:
+    poses = drive_poses(30)
+    names = [f"{index:06d}" for index in range(30)]
+    check_steps(poses, names, *NAMED)
+    for metres in (20, 900):
+        for index in (1, 12, 28):
+            wrong = poses.copy()
+            wrong[index, 1, 3] += metres
+            fails(partial(check_steps, wrong, names, *NAMED), names[index], "m off the way")
+
+
+def test_poses_of_kilometres_are_named() -> None:
+    """The first scans had no fix."""
+    poses = drive_poses(30)
+    names = [f"{index:06d}" for index in range(30)]
+    for first in (1, 5):
+        wrong = poses.copy()
+        wrong[first:, :2, 3] += (690_000, 5_335_000)
+        words = (names[first - 1], names[first], "5,379,4")
+        fails(partial(check_steps, wrong, names, *NAMED), "poses", *words)
+    check_steps(wrong[first:], names[first:], *NAMED)
+
+
+def test_ways_that_a_car_takes_have_no_jump() -> None:
+    """It stands, turns round, pauses the recording, and is seen in whole metres."""
+    poses = drive_poses(30)
+    names = [f"{index:06d}" for index in range(30)]
+    back = np.concatenate((poses[:15], poses[13::-1]))
+    gap = poses.copy()
+    gap[12:, 0, 3] += 300
+    whole = poses.copy()
+    whole[:, :3, 3] = np.round(whole[:, :3, 3])
+    for some in (poses[:2], poses[::5], back, gap, whole, np.repeat(poses[:1], 9, axis=0)):
+        check_steps(some, names[: len(some)], *NAMED)
 
 
 def test_scans_without_points_to_compare_fit_any_poses() -> None:
     none = np.empty((0, 3))
-    check_fit([], "poses")
-    check_fit([Pair(none, posts(), motion_of(4)), Pair(posts(), none, motion_of(4))], "poses")
+    check_fit([], *NAMED)
+    check_fit(
+        [Pair(none, posts(), motion_of(4)), Pair(posts(), none, motion_of(4))], "poses", "advice"
+    )

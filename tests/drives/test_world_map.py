@@ -100,6 +100,20 @@ def test_a_map_far_from_the_origin_is_continued_as_it_was(tmp_path: Path) -> Non
     np.testing.assert_array_equal(other.build().xyz, builder.build().xyz)
 
 
+def test_what_the_keys_of_voxels_cannot_reach_is_one_line() -> None:
+    builder = MapBuilder(SIZE, SEMANTICKITTI)
+    xyz, scores = np.array([[1.1, 0.1, 0.1]]), scores_of(np.array([ROAD]))
+    builder.add(xyz, scores, np.eye(4))
+    reach = SIZE * (1 << 20)
+    pose = np.eye(4)
+    pose[0, 3] = reach - 2
+    builder.add(xyz, scores, pose)
+    assert builder.build().xyz[:, 0].max() == pytest.approx(reach - 0.9)
+    for place in (reach, -reach - 2):
+        pose[0, 3] = place
+        fails(lambda: builder.add(xyz, scores, pose), "within 524 km", "--voxel")
+
+
 def test_a_car_that_drives_away_leaves_the_road() -> None:
     builder = MapBuilder(SIZE, SEMANTICKITTI)
     xyz = np.array([[1.1, 0.1, 0.1]])

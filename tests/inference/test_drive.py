@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.poses import Poses
 from amvnet.drives.consensus import REACH
 from amvnet.drives.odometry import Odometry, Pair, check_fit
+from amvnet.inference import drive as drive_module
 from amvnet.inference.drive import Drives, find_poses
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.pipeline import Pipeline
@@ -93,10 +95,18 @@ def test_lost_returns_of_a_drive_get_no_label_and_move_no_pose(world: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("poses", "words"), [(POSES[:2], ["for each scan", "found 2"]), (0 * POSES, ["no rotation"])]
+    ("poses", "words"),
+    [
+        (POSES[:2], ["for each scan", "found 2"]),
+        (0 * POSES, ["no rotation"]),
+        (np.ones(16), ["(4, 4)", "shape ()"]),
+        (np.eye(3), ["(4, 4)", "shape (3,)"]),
+        ("poses.txt", ["(4, 4)", "'p'"]),
+        (Path("poses.txt"), ["(4, 4)", "poses.txt"]),
+    ],
 )
 def test_too_few_or_impossible_poses_are_one_line(
-    world: Path, poses: Poses, words: list[str]
+    world: Path, poses: Any, words: list[str]
 ) -> None:
     segmenter = amvnet.load(world / "w.safetensors")
     scans = [points for points, _ in drive_scans(3)]
@@ -219,13 +229,61 @@ def lost(poses: Poses) -> Poses:
     return poses
 
 
-@pytest.mark.parametrize("spoil", [of_camera, stretched, a_quarter_longer, backwards, fewer, lost])
+def first_without_a_fix(poses: Poses) -> Poses:
+    poses = poses.copy()
+    poses[1:, :2, 3] += (690_000, 5_335_000)
+    return poses
+
+
+def one_off(poses: Poses) -> Poses:
+    poses = poses.copy()
+    poses[7, 0, 3] += 20
+    return poses
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        *(of_camera, stretched, a_quarter_longer, backwards, fewer, lost),
+        *(first_without_a_fix, one_off),
+    ],
+)
 def test_poses_that_do_not_fit_are_one_line_and_nothing_is_written(
     world: Path, tmp_path: Path, spoil: Callable[[Poses], Poses]
 ) -> None:
     np.save(tmp_path / "poses.npy", spoil(POSES))
     refused(predict(world, tmp_path / "out", f"--poses {tmp_path}/poses.npy"), "poses.npy")
     assert not (tmp_path / "out").exists()
+
+
+def test_poses_that_were_turned_by_a_calibration_say_so(world: Path, tmp_path: Path) -> None:
+    """A refusal names the calibration that is missing, or that does not belong to the poses."""
+    shutil.copytree(world / "data/sequences/00/velodyne", tmp_path / "scans")
+    scans, _ = list_inputs([f"{tmp_path}/scans"])
+    of_lidar = tmp_path / "poses.txt"
+    np.savetxt(of_lidar, POSES[:, :3].reshape(-1, 12))
+    lines: list[str] = []
+    find_poses(scans, of_lidar, report=lines.append)
+    assert lines[-1].endswith("by the file, as the LiDAR's, without calib.txt beside it")
+
+    kitti = tmp_path / "00.txt"
+    shutil.copy(world / "data/sequences/00/poses.txt", kitti)
+    fails(lambda: find_poses(scans, kitti), "00.txt", "without calib.txt", "apart")
+    shutil.copy(world / "data/sequences/00/calib.txt", tmp_path)
+    find_poses(scans, kitti, report=lines.append)
+    assert lines[-1].endswith("by the file, turned from the camera by calib.txt beside it")
+    fails(lambda: find_poses(scans, of_lidar), "poses.txt", "turned from the camera", "apart")
+
+
+def test_poses_that_were_estimated_are_not_to_be_estimated(
+    world: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drive_module, "_estimated", lambda *_: stretched(POSES))
+    scans, _ = list_inputs([f"{world}/data"])
+    monkeypatch.setattr(type(scans[0]), "poses", lambda *_: None)
+    fails(lambda: find_poses(scans), "KISS-ICP", "give poses, or scans that follow")
+    monkeypatch.setattr(type(scans[0]), "poses", lambda *_: stretched(POSES))
+    fails(lambda: find_poses(scans), "the dataset", "correct them")
 
 
 def test_poses_of_ones_own_scans_move_the_points_of_their_files(
@@ -269,10 +327,15 @@ def test_poses_of_ones_own_scans_move_the_points_of_their_files(
 
 def test_poses_of_a_standing_car_fit() -> None:
     points = drive_scans(2)[0][0][:, :3]
-    check_fit([Pair(points, points + 0.01, np.eye(4))], "poses")
+    check_fit([Pair(points, points + 0.01, np.eye(4))], "poses", "advice")
     moved = np.eye(4)
     moved[0, 3] = 3
-    fails(lambda: check_fit([Pair(points, points + 0.01, moved)], "poses"), "poses", "apart")
+    fails(
+        lambda: check_fit([Pair(points, points + 0.01, moved)], "poses", "advice"),
+        "poses",
+        "apart",
+        "advice",
+    )
 
 
 def test_a_drive_needs_scans_of_one_recording_in_a_row(world: Path, tmp_path: Path) -> None:

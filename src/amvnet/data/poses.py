@@ -6,14 +6,17 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import is_zipfile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.errors import InputError
+from amvnet.data.formats.numpy_files import member_names, read_array
+from amvnet.errors import InputError, readable, shown
 
 KITTI_COLUMNS = 12  # the upper three rows of a 4 x 4 matrix
 TUM_COLUMNS = 8  # time x y z qx qy qz qw
+UNITS = (1e3, 1e6, 1e9, 1e12, 1e-3, 1e-6, 1e-9)  # ratios of two units of time that are not the same
 CALIBRATION = "calib.txt"  # KITTI's file next to its poses; its `Tr` moves points into camera 0
 FARTHEST = 1e8  # largest coordinate of a pose, metres: more than the radius of the Earth
 EDGE = 0.5  # seconds before the first pose and after the last one in which the motion goes on
@@ -33,11 +36,28 @@ class Trajectory:
     Attributes:
         poses: (N, 4, 4) float64, each moves points of the sensor into the world.
         times: (N,) seconds, ascending, or None if the file has none.
+        note: how poses in KITTI's format were taken: as the camera's or as the LiDAR's.
     """
 
     name: str
     poses: Poses
     times: NDArray[np.float64] | None = None
+    note: str = ""
+
+    def numbered(self, names: Sequence[str]) -> Poses:
+        """Return the poses (M, 4, 4) of scans whose names are the numbers of their poses, from 0.
+
+        Raises:
+            InputError: if there is no pose of this number.
+        """
+        count = len(self.poses)
+        for name in names:
+            if not name.isdecimal() or int(name) >= count:
+                raise InputError(
+                    f"{self.name}: expected a pose for each scan, found {count} poses and the scan "
+                    f"{name}; give the poses of this sequence, or name scans by their numbers"
+                )
+        return self.poses[list(map(int, names))]
 
     def at(self, times: Sequence[float] | None, count: int) -> Poses:
         """Return the poses (count, 4, 4) of some scans.
@@ -76,10 +96,14 @@ class Trajectory:
         edge = min(EDGE, last - first)  # 0 for a single pose
         is_inside = first - edge <= scan_times.min() and scan_times.max() <= last + edge
         if not edge or not is_inside:
+            start, end = scan_times.min(), scan_times.max()
+            advice = "give the poses of this drive, by the same clock"
+            for ratio in UNITS:
+                if start * ratio <= last and first <= end * ratio:
+                    advice = f"in a unit {ratio:g} of the scans'; give both in seconds"
             raise InputError(
-                f"{self.name}: expected times that include the scans' ({scan_times.min():.2f} to "
-                f"{scan_times.max():.2f} s), found {first:.2f} to {last:.2f} s; give the poses of "
-                "this drive, by the same clock"
+                f"{self.name}: expected times that include the scans' ({start:.2f} to {end:.2f} "
+                f"s), found {first:.2f} to {last:.2f} s; {advice}"
             )
 
         # The motion from the end to a time after it is the motion to the end, as long before it.
@@ -124,20 +148,8 @@ def read_poses(path: Path) -> Trajectory:
     Raises:
         InputError: if the file is missing, has another format, or holds no finite rigid motions.
     """
-    try:
-        if path.suffix == ".npy":
-            table = np.load(path, allow_pickle=False)
-        else:
-            with path.open(errors="replace") as file, warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # about an empty file
-                table = np.loadtxt(file, np.float64, ndmin=2)
-    except OSError as error:
-        raise InputError(
-            f"{path}: expected {EXPECTED}, found {error.strerror}; check the path"
-        ) from None
-    except (ValueError, EOFError):
-        raise InputError(f"{path}: expected {EXPECTED}, found another file; convert it") from None
-
+    with readable(path):
+        table = _read_array(path) if path.suffix in (".npy", ".npz") else _read_table(path)
     shape = table.shape
     if table.dtype.kind in "fiu" and table.ndim == 3 and shape[1:] in ((4, 4), (3, 4)):
         poses = table.astype(np.float64)[:, :3]
@@ -151,10 +163,37 @@ def read_poses(path: Path) -> Trajectory:
     whole = np.tile(np.eye(4), (len(poses), 1, 1))
     whole[:, :3] = poses
     check_rigid(whole, str(path))
+    if shape[1:] != (KITTI_COLUMNS,):
+        return Trajectory(str(path), whole)
     calibration = path.with_name(CALIBRATION)
-    if shape[1:] == (KITTI_COLUMNS,) and calibration.is_file():
-        whole = _from_camera(whole, calibration)
-    return Trajectory(str(path), whole)
+    if not calibration.is_file():
+        return Trajectory(str(path), whole, note=f"as the LiDAR's, without {CALIBRATION} beside it")
+    note = f"turned from the camera by {CALIBRATION} beside it"
+    return Trajectory(str(path), _from_camera(whole, calibration), note=note)
+
+
+def _read_array(path: Path) -> NDArray[np.generic]:
+    """Read an array, also of an archive that holds no other."""
+    names = member_names(path) if is_zipfile(path) else []
+    if len(names) > 1:
+        raise InputError(
+            f"{path}: expected {EXPECTED}, found an archive of {shown(', '.join(names))}; save the "
+            "poses alone"
+        )
+    return read_array(path)
+
+
+def _read_table(path: Path) -> NDArray[np.float64]:
+    """Read numbers separated by spaces or commas, after one line of names if there is one."""
+    lines = path.read_text("utf-8-sig", errors="replace").replace(",", " ").splitlines()
+    if lines and all(times_of([word]) is None for word in lines[0].split()):
+        del lines[0]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about an empty file
+            return np.loadtxt(lines, np.float64, ndmin=2)
+    except ValueError:
+        raise InputError(f"{path}: expected {EXPECTED}, found another file; convert it") from None
 
 
 def timed_poses(name: str, table: NDArray[np.float64]) -> Trajectory:
@@ -182,9 +221,30 @@ def timed_poses(name: str, table: NDArray[np.float64]) -> Trajectory:
     poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
     poses[:, :3, 3] = table[:, 1:4]
     check_rigid(poses, name)
-    if not (np.diff(table[:, 0]) > 0).all():
-        raise InputError(f"{name}: expected ascending times, found others; sort them")
+    steps = np.diff(table[:, 0])
+    if not (steps > 0).all():
+        index = int(np.argmin(steps > 0)) + 1
+        fault, advice = ("twice", "remove one") if not steps[index - 1] else ("late", "sort them")
+        raise InputError(
+            f"{name}: expected ascending times, found {table[index, 0]:.9g} s {fault}, in pose "
+            f"{index}; {advice}"
+        )
     return Trajectory(name, poses, table[:, 0])
+
+
+def as_pose(value: object, name: str) -> Poses:
+    """Return the pose (4, 4) that a user gives as an array; raise InputError if it is none."""
+    try:
+        pose = np.asarray(value, np.float64)
+        found = f"shape {pose.shape}"
+    except (TypeError, ValueError):
+        pose, found = np.empty(0), shown(value)
+    if pose.shape != (4, 4):
+        raise InputError(
+            f"{name}: expected an array (4, 4) for each scan, found {found}; give (N, 4, 4) in all"
+        )
+    check_rigid(pose[None], name)
+    return pose
 
 
 def check_rigid(poses: Poses, name: str) -> None:

@@ -20,6 +20,7 @@ LEAST = 0.01  # smaller probabilities count as this, so that no scan alone rules
 # that left the reach leaves nothing behind, and a resumed run computes the same labels.
 STEPS = 16
 _BITS = 21  # bits of a voxel's place along one axis
+LARGEST_INDEX = 1 << (_BITS - 1)  # voxels in so many places on each side have keys of their own
 
 Item = TypeVar("Item")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,9 @@ OTHERS = (0.0, 0.8, 1.25)  # multiples of a motion; if it is true, it brings the
 # With true poses, the median distance is at most 0.62 of the least distance under the other
 # motions, and with wrong poses at least 1.1 times that distance (docs/log.md).
 LARGEST_RATIO = 0.75
+FARTHEST_STEP = 1000.0  # largest distance between two scans in a row, metres
+# A pose may lead off the way between its neighbours by so many metres, or typical steps.
+LARGEST_DETOUR, DETOUR_STEPS = 2.0, 5.0
 VOXEL = 1.0  # edge of the voxels of KISS-ICP's map, metres
 
 
@@ -72,11 +75,38 @@ class Pair:
     motion: Poses
 
 
-def check_fit(pairs: Iterable[Pair], name: str) -> None:
+def check_steps(poses: Poses, names: Sequence[str], name: str, advice: str) -> None:
+    """Check that a drive has no jump: the pose of each scan is near those before it and after it.
+
+    The message begins with `name`, has the `names` of the scans whose poses (N, 4, 4) jump, and
+    ends with `advice`. The pairs of `check_fit` are too few to show a single pose that is wrong.
+
+    Raises:
+        InputError: if two scans in a row are very far apart, or a single pose lies off the way.
+    """
+    places = poses[:, :3, 3]
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    if steps.max() > FARTHEST_STEP:
+        index = int(np.argmax(steps))
+        raise InputError(
+            f"{name}: expected the poses of one drive, found {steps[index]:,.0f} m between the "
+            f"scans {names[index]} and {names[index + 1]}; take either part, or {advice}"
+        )
+
+    detours = (steps[:-1] + steps[1:] - np.linalg.norm(places[2:] - places[:-2], axis=1)) / 2
+    if (detours > max(LARGEST_DETOUR, DETOUR_STEPS * np.median(steps))).any():
+        index = int(np.argmax(detours))
+        raise InputError(
+            f"{name}: expected the poses of one drive, found that of the scan {names[index + 1]} "
+            f"{detours[index]:,.0f} m off the way; leave this scan out, or {advice}"
+        )
+
+
+def check_fit(pairs: Iterable[Pair], name: str, advice: str) -> None:
     """Check that poses fit the scans: that the surfaces of two scans meet in the world.
 
     With wrong poses, each wall is seen twice, and another motion brings the scans closer together:
-    none, a shorter one or a longer one. The message begins with `name`.
+    none, a shorter one or a longer one. The message begins with `name` and ends with `advice`.
 
     Raises:
         InputError: if the poses do not fit.
@@ -102,8 +132,7 @@ def check_fit(pairs: Iterable[Pair], name: str) -> None:
         motion = f"motions {factor:g} times as long" if factor else "no motion"
         raise InputError(
             f"{name}: expected poses under which the scans meet, found their points {given:.2f} m "
-            f"apart, and {least:.2f} m with {motion}; give the poses of this drive's LiDAR in "
-            "metres, or let them be estimated"
+            f"apart, and {least:.2f} m with {motion}; {advice}"
         )
 
 

@@ -16,7 +16,15 @@ from amvnet.data.labels.clouds import COLORS, write_cloud
 from amvnet.data.palette import class_colors
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.drives.consensus import STEPS, VoxelTable, index_of, keys_of, sum_by, weighted_logs
+from amvnet.drives.consensus import (
+    LARGEST_INDEX,
+    STEPS,
+    VoxelTable,
+    index_of,
+    keys_of,
+    sum_by,
+    weighted_logs,
+)
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.outputs import Signature
@@ -98,7 +106,11 @@ class MapBuilder:
         self._origin: NDArray[np.floating] | None = None
 
     def add(self, xyz: NDArray[np.floating], scores: NDArray[np.floating], pose: Poses) -> None:
-        """Add a scan: points (N, 3) in metres, their scores (N, K), and the pose (4, 4)."""
+        """Add a scan: points (N, 3) in metres, their scores (N, K), and the pose (4, 4).
+
+        Raises:
+            InputError: if a point is farther from the first scan than the map reaches.
+        """
         if self._origin is None:
             self._origin = np.floor(pose[:3, 3])
         has_scores, _, weighted = weighted_logs(scores)
@@ -107,6 +119,12 @@ class MapBuilder:
 
         index = np.floor(world / self.size).astype(np.int64)
         within = (world - index * self.size).astype(np.float32)
+        if len(index) and not -LARGEST_INDEX <= index.min() <= index.max() < LARGEST_INDEX:
+            reach = LARGEST_INDEX * self.size / 1000
+            raise InputError(
+                f"expected a map within {reach:.0f} km of its first scan, found "
+                f"{np.abs(world).max() / 1000:,.0f} km; correct the poses, or give a larger --voxel"
+            )
         keys, inverse = np.unique(keys_of(index), return_inverse=True)
         values = np.concatenate((weighted, within, np.ones((len(world), 1), np.float32)), axis=1)
         self._table.add(keys, sum_by(inverse, values, len(keys)))

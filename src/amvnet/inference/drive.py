@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.data.poses import Poses, check_rigid, read_poses, times_of
+from amvnet.data.poses import Poses, as_pose, check_rigid, read_poses, times_of
 from amvnet.data.spacing import evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
-from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit
+from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit, check_steps
 from amvnet.errors import InputError
 from amvnet.files import digest
 from amvnet.inference.listing import InputScan, LoadedScan, Outcome
@@ -32,6 +32,14 @@ STANDING = -1.2  # height above which points of a normalised scan stand on the g
 # the same place differ, and the consensus corrects more of them.
 TURN = math.pi * (3 - math.sqrt(5))
 FAR = 8.0  # distance up to which two scans are compared if they are not consecutive, metres
+ESTIMATE = "KISS-ICP"
+DATASET = "the dataset"
+# What a user can do if the poses do not fit, by where they come from.
+ADVICE = {
+    ESTIMATE: "give poses, or scans that follow each other more closely",
+    DATASET: "correct them, or give other poses",
+}
+OTHER_POSES = "give the poses of this drive's LiDAR in metres, or let them be estimated"
 LEAST_SCANS = 2  # smallest number of scans of a drive
 
 
@@ -165,7 +173,7 @@ def drive(
     """
 
     def segmented() -> Iterator[DriveScan[Segmentation]]:
-        given = None if poses is None else iter(poses)
+        given = None if poses is None else iter(poses if isinstance(poses, Iterable) else [poses])
         odometry = Odometry() if given is None else None
         for index, points in enumerate(scans):
             result = segmenter(points, yaw=index * TURN)
@@ -179,9 +187,7 @@ def drive(
                     raise InputError(
                         f"poses: expected a pose for each scan, found {index}; give one for each"
                     )
-                pose = np.asarray(found, np.float64)
-                check_rigid(pose[None], "poses")
-                pose = pose @ to_file(scan)
+                pose = as_pose(found, "poses") @ to_file(scan)
             yield DriveScan(result, scan.points[:, :3], result.scores, pose)
 
     for result, scores, _ in Consensus(past_only=past_only).stream(segmented()):
@@ -257,10 +263,12 @@ def find_poses(
             topic = None if bag is None else bag.odometry()
             other = "" if topic is None else f"; --poses {topic} takes those of the bag"
             report(f"{name}: estimating the poses of {counted(len(members), 'scan')}{other}")
-            poses, where = _estimated(members, progress), "KISS-ICP"
+            poses, where = _estimated(members, progress), ESTIMATE
 
         check_rigid(poses, name)
-        check_fit(_pairs(members, poses), name)
+        says = f"{name}, by {where}", ADVICE.get(where, OTHER_POSES)
+        check_steps(poses, [scan.name for scan in members], *says)
+        check_fit(_pairs(members, poses), *says)
         metres = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
         report(f"{name}: a drive of {counted(len(members), 'scan')}, {metres:.0f} m by {where}")
         found |= {key_of(scan): pose for scan, pose in zip(members, poses, strict=True)}
@@ -278,9 +286,10 @@ def _recorded(
         track = read_poses(path)
         # All of a bag is read for the times of its scans.
         times = None if len(track.poses) == len(scans) else _times(scans)
-        return track.at(times, len(scans)), "the file"
+        note = f", {track.note}" if track.note else ""
+        return track.at(times, len(scans)), f"the file{note}"
 
-    return scans[0].poses(scans), "the dataset"
+    return scans[0].poses(scans), DATASET
 
 
 def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:

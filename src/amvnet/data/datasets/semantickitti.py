@@ -91,14 +91,7 @@ class SemanticKitti(Dataset):
         if not path.is_file():
             return None
         # The line of a pose is the number of its scan.
-        poses = read_poses(path).poses
-        numbers = [int(record.points_path.stem) for record in records]
-        if max(numbers) >= len(poses):
-            raise InputError(
-                f"{path}: expected a pose for each scan, found {len(poses)} poses and the scan "
-                f"{max(numbers):06d}; give the poses of this sequence"
-            )
-        return poses[numbers]
+        return read_poses(path).numbered([record.points_path.stem for record in records])
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""
