@@ -26,6 +26,7 @@ from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
+from fixtures.browser_pages import read_page
 from fixtures.commands import fails, refused, run_cli, succeed
 from fixtures.drives import SCANS, drive_poses, write_drive
 from fixtures.tiny import fresh_weights
@@ -169,7 +170,8 @@ def test_both_formats_read_back_equal_and_as_the_figures_say(world: Path, tmp_pa
 
 def test_the_viewer_and_the_readers_take_a_map(world: Path, tmp_path: Path) -> None:
     succeed(command(world, tmp_path / "map.ply"))
-    succeed(f"view {tmp_path}/map.ply --labels {tmp_path}/map.ply --html {tmp_path}/map.html")
+    succeed(f"view {tmp_path}/map.ply --html {tmp_path}/map.html")
+    assert read_page(tmp_path / "map.html").about["sources"]
     vertices = PlyData.read(tmp_path / "map.ply")["vertex"]
     assert len(amvnet.read(tmp_path / "map.ply")) == len(vertices)
 

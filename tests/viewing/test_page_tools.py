@@ -107,6 +107,31 @@ def test_a_scan_that_is_not_whole_cannot_be_corrected(tmp_path: Path, browser: B
     assert "hidden" in edit
 
 
+@pytest.mark.parametrize("labelled", [True, False])
+def test_only_labels_can_be_corrected(labelled: bool, tmp_path: Path, browser: Browser) -> None:
+    points = np.array([[1, 2, 0, 0], [3, 4, 0, 0]], np.float32)
+    labels = {"labels": np.array([1, 2])} if labelled else {}
+    shown = ShownScan("s", points, np.ones(2, bool), None, labels)
+    write_page(tmp_path / "p.html", [shown], SEMANTICKITTI, "")
+    dom = browser.state(tmp_path / "p.html")["dom"]
+    assert dom.texts["box-title"] == ("Box, correct labels" if labelled else "Box")
+
+
+@pytest.mark.parametrize(("is_open", "least"), [(False, 0.8), (True, 0.45)])
+def test_a_phone_shows_the_scan_above_the_panel(
+    is_open: bool, least: float, page: Path, tmp_path: Path, browser: Browser
+) -> None:
+    """Windows of Chromium are wider than phones, frames are not."""
+    script = "if (OPEN) panel.fold(); const { top } = byId('timeline').getBoundingClientRect();"
+    script += "parent.postMessage(top / innerHeight, '*')"
+    with_script(page, tmp_path / "inner.html", script.replace("OPEN", str(is_open).lower()))
+    frame = '<iframe src="inner.html" style="width: 390px; height: 844px"></iframe>'
+    listener = "<script>onmessage = ({ data }) => { document.title = data; }</script>"
+    outer = tmp_path / "outer.html"
+    outer.write_text(f"<!doctype html><html><title>-</title>{listener}{frame}</html>")
+    assert least < float(browser.state(outer)["title"]) < 0.95
+
+
 def test_the_tape_measures_metres(page: Path, tmp_path: Path, browser: Browser) -> None:
     script = "tape.toggle(); tape.add(7); tape.add(1234); draw()"
     state = browser.state(with_script(page, tmp_path / "p.html", script))

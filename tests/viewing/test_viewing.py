@@ -17,20 +17,23 @@ import numpy as np
 import pytest
 
 import amvnet
+from amvnet.data.class_maps import class_map
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.labels.readers import read_raw_labels
+from amvnet.data.labels.writers import write_scan_labels
 from amvnet.data.palette import WRONG, class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.evaluation.scoring import labels_by_method
 from amvnet.files import unfinished
 from amvnet.viewing import page as pages
-from amvnet.viewing.shown_scans import RIGHT, ShownScan, shown_scan
+from amvnet.viewing.shown_scans import CORRECT, ShownScan, shown_scan
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page, with_script
-from fixtures.commands import files, run_cli
+from fixtures.commands import files, refused, run_cli
 from fixtures.marks import with_full
 from fixtures.pages import Changes, DocsPage, run
 from fixtures.scan_writers import write_bag1
@@ -366,6 +369,54 @@ def test_labels_of_every_format_of_predict_are_shown(
         np.testing.assert_array_equal(planes["labels"], expected["amvnet"])
 
 
+@pytest.mark.parametrize("kind", with_full(["ply", "pcd", "las", "laz"], ["ply", "pcd"]))
+def test_a_file_of_predict_shows_its_labels_itself(world: Path, tmp_path: Path, kind: str) -> None:
+    options = ("--weights", world / "w.safetensors", "--out", tmp_path, "--format", kind)
+    assert run_cli("predict", world / "lone.bin", *options, "--classes", "coarse")[0] == 0
+    ids = read_raw_labels(tmp_path / f"lone.{kind}", 300, missing=0)
+
+    page = view_page(tmp_path, tmp_path / f"lone.{kind}")
+    assert page.about["classes"][1:] == list(class_map("coarse").target.classes)
+    assert [source["key"] for source in page.about["sources"]] == ["labels"]
+    _, planes = page.scan(0)
+    assert planes["labels"].tolist() == ids.tolist()
+
+
+def test_a_file_shows_its_labels_only_in_its_own_classes(world: Path, tmp_path: Path) -> None:
+    options = ("--weights", world / "w.safetensors", "--out", tmp_path, "--format", "ply")
+    assert run_cli("predict", world / "lone.bin", *options)[0] == 0
+    ply = tmp_path / "lone.ply"
+    refused(("view", ply, "--taxonomy", "nuscenes"), ply, "classes of nuscenes", "semantickitti")
+
+    without_comments = re.sub(rb"comment [^\n]*\n", b"", ply.read_bytes())
+    ply.write_bytes(without_comments)
+    assert view_page(tmp_path, ply).about["sources"] == []
+
+
+@pytest.mark.parametrize("legend", ["classes []", 'class {"id": []}', "class [", "classes " * 99])
+def test_comments_of_a_stranger_are_no_classes(tmp_path: Path, legend: str) -> None:
+    header = f"ply\nformat ascii 1.0\ncomment amvnet {legend}\nelement vertex 1\n"
+    path = tmp_path / "a.ply"
+    path.write_text(
+        header + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n1 2 3\n"
+    )
+    assert view_page(tmp_path, path).about["sources"] == []
+
+
+def test_a_map_far_from_its_origin_is_shown(tmp_path: Path) -> None:
+    place = np.array([600.4, 1600.3, -30.0])
+    xyz = np.random.default_rng(0).uniform(-40, 40, (500, 3)) + place
+    ids = np.arange(500) % 20
+    path = write_scan_labels(tmp_path / "map", "ply", xyz, ids, SEMANTICKITTI)
+    page = view_page(tmp_path, path)
+
+    shown, planes = page.scan(0)
+    origin = page.about["scans"][0]["origin"]
+    assert np.abs(shown).max() < 60
+    np.testing.assert_allclose(shown + origin, xyz, atol=0.01)
+    assert planes["labels"].tolist() == ids.tolist()
+
+
 def test_scans_are_read_as_predict_reads_them(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -561,7 +612,7 @@ def test_the_picture_shows_what_is_asked_for_at_its_place(tmp_path: Path, browse
     assert car_rows.max() < building_rows.min() + 3
 
     errors = browser.picture(path, f"{look}&color=error&hide=15")
-    right_rows, right_columns = pixels_of(errors, RIGHT)
+    right_rows, right_columns = pixels_of(errors, CORRECT)
     wrong_rows, _ = pixels_of(errors, WRONG)
     assert right_columns.max() < green_columns.min() + 3
     assert right_rows.max() < wrong_rows.min() + 3

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from amvnet.data.class_maps import class_map
 from amvnet.data.formats.registry import check_packages
 from amvnet.data.labels.clouds import COLORS, write_cloud
+from amvnet.data.labels.legend import legend_of
 from amvnet.data.palette import class_colors
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
@@ -85,7 +86,7 @@ class WorldMap:
         columns["confidence"] = self.confidence
         columns["sights"] = self.sights
         with atomic_write(path) as part:
-            write_cloud(part, path.suffix, columns, PROGRAM)
+            write_cloud(part, path.suffix, columns, legend_of(self.taxonomy), PROGRAM)
 
 
 class MapBuilder:

@@ -19,10 +19,11 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.labels.legend import read_legend
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.poses import Poses
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.files import inside
 from amvnet.inference.segmentation import Segmentation
@@ -117,6 +118,10 @@ class InputScan(ABC):
 
         `path` is a folder of predictions, or the label file of a scan that is in no dataset.
         """
+
+    def stored_labels(self, count: int) -> np.ndarray | None:
+        """Return the (N,) train ids that `predict` or `map` wrote next to N = `count` points."""
+        return None
 
     @abstractmethod
     def write_labels(
@@ -267,6 +272,19 @@ class FileScan(InputScan):
             path = next(filter(Path.is_file, paths), paths[0])
         return read_scan_labels(path, count, self.taxonomy)
 
+    def stored_labels(self, count: int) -> np.ndarray | None:
+        """Return the labels in the file of the points, if it names their classes."""
+        classes = read_legend(self.path)
+        if classes is None:
+            return None
+        if classes.classes != self.taxonomy.classes:
+            found = describe_difference(self.taxonomy.classes, classes.classes, classes.name)
+            raise InputError(
+                f"{self.path}: expected labels with the classes of {self.taxonomy.name}, "
+                f"found {found}; show this file alone"
+            )
+        return read_scan_labels(self.path, count, self.taxonomy)
+
     def write_labels(
         self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str
     ) -> Path:
@@ -343,8 +361,9 @@ class Inputs:
 
         Args:
             taxonomy: the classes of the weights, or the classes that the user names. By default, a
-                dataset has its own classes, a scan file whose name ends in `.pcd.bin` has the
-                classes of nuScenes, and any other scan file has the classes of SemanticKITTI.
+                dataset has its own classes, a scan file has the classes that it names, one whose
+                name ends in `.pcd.bin` has the classes of nuScenes, and any other scan file has the
+                classes of SemanticKITTI.
             normaliser: normalises scan files to weights; without it, they stay unchanged.
             written: the classes of the labels that are written; by default the classes above.
             official: whether labels are written in the official formats of datasets, in which
@@ -372,8 +391,7 @@ class Inputs:
             else:
                 if normaliser is not None:
                     normaliser.recall(measured)
-                is_nuscenes = part[0].ending == NUSCENES_ENDING
-                taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
+                taxonomies.append(taxonomy or _classes_of(part[0]))
                 scans += reader.scans(part, written or taxonomies[-1])
             measured = {}
 
@@ -383,6 +401,12 @@ class Inputs:
                 "take them one after the other"
             )
         return scans, taxonomies[0]
+
+
+def _classes_of(scan: NamedScan) -> Taxonomy:
+    """Return the classes of a scan file's labels, if the user names none."""
+    usual = NUSCENES if scan.ending == NUSCENES_ENDING else SEMANTICKITTI
+    return read_legend(scan.path) or usual
 
 
 class _ReadOnce:

@@ -30,7 +30,7 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
 from amvnet.outputs import Signature, check_outputs
 from amvnet.scan import AnyArray, Scan
-from amvnet.viewing.shown_scans import RIGHT, UNSCORED, ShownScan, short_name, shown_scan
+from amvnet.viewing.shown_scans import CORRECT, UNSCORED, ShownScan, short_name, shown_scan
 
 # Largest number of points of a scan that the page shows. The page shows every second or third point
 # of a larger scan, so that phones keep up.
@@ -44,7 +44,7 @@ RAMP_STOPS = 17  # the number of colours between which the page interpolates a r
 # Matplotlib's colour map for each ramp, and the part of the map that is used, in [0, 1].
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
 # The colours from no disagreement to full disagreement of the networks, RGB in 0..255.
-UNCERTAINTY_RAMP = (RIGHT, (122, 104, 132), (190, 124, 158), UNCERTAIN, (255, 205, 220))
+UNCERTAINTY_RAMP = (CORRECT, (122, 104, 132), (190, 124, 158), UNCERTAIN, (255, 205, 220))
 # The order counts: later scripts use what earlier scripts define.
 SCRIPTS = (
     "scans.js",
@@ -208,6 +208,7 @@ def pack(shown: ShownScan) -> Packed:
         "count": len(indices),
         "note": "; ".join(notes),
         "corrected": shown.corrected,
+        "origin": shown.origin,
         "center": center.tolist(),
         "step": step.tolist(),
         "planes": list(planes),
@@ -295,7 +296,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
 def drawing() -> dict[str, Any]:
     """Return the colours that the page's scripts use for any scan, for the page's JSON."""
     return {
-        "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
+        "marks": {"correct": CORRECT, "wrong": WRONG, "unscored": UNSCORED},
         "ramps": {
             "uncertainty": UNCERTAINTY_RAMP,
             "height": _ramp(*RAMPS["height"]),

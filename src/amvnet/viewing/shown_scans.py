@@ -27,8 +27,10 @@ from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan
 
 # Colours for a dark background, RGB in 0..255.
-RIGHT = (78, 92, 112)
+CORRECT = (78, 92, 112)
 UNSCORED = (40, 47, 58)
+
+NEAR = 200.0  # largest distance from the origin to the middle of a map that stays there, metres
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class ShownScan:
             probabilities; None without two networks.
         corrected: the place of the scan's corrected labels, relative to the folder of the dataset;
             its ending names their form. Empty if the scan has no such place.
+        origin: (3,) the place of the points' origin in the file, metres; not 0 for maps that lie
+            elsewhere.
     """
 
     name: str
@@ -63,6 +67,7 @@ class ShownScan:
     uncertain: np.ndarray | None = None
     disagreement: np.ndarray | None = None
     corrected: str = ""
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 def check_labels(labels: Path, count: int) -> None:
@@ -88,7 +93,7 @@ def show_scans(
     Args:
         segmenter: labels the scans; the labels of its networks are shown with its own.
         labels: without a segmenter, a folder of predictions as `predict` writes them, or the label
-            file of a single scan.
+            file of a single scan; by default, the labels that files of `predict` and `map` hold.
 
     Raises:
         InputError: if a file is broken or missing.
@@ -112,14 +117,27 @@ def show_scans(
             truth=scan.labels,
             corrected=scan_input.corrected,
         )
-        if labels is None:
+        if labels is not None:
+            ids = scan_input.read_labels(labels, len(scan))
+        elif (stored := scan_input.stored_labels(len(scan))) is not None:
+            ids = stored
+            shown = _near_the_middle(shown)
+        else:
             return shown
-
-        ids = scan_input.read_labels(labels, len(scan))
         return replace(shown, labels={"labels": ids})
 
     at_once = 1 if segmenter is None else segmenter.at_once
     return stream_scans(scans, load, show, at_once, progress)
+
+
+def _near_the_middle(shown: ShownScan) -> ShownScan:
+    """Return a map with its middle at the origin, unless it is near: the page is of one place."""
+    middle = np.median(shown.points[shown.valid, :3], axis=0).round()
+    if np.abs(middle).max() <= NEAR:
+        return shown
+    points = shown.points.copy()
+    points[:, :3] -= middle
+    return replace(shown, points=points, origin=tuple(middle.tolist()))
 
 
 def short_name(scan: Scan) -> str:

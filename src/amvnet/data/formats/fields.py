@@ -68,8 +68,8 @@ class Fields:
         return arrays
 
 
-def read_header_line(file: BinaryIO, path: Path, kind: str, end: str) -> list[str]:
-    """Return the words of the next line of a header, which ends with the line `end`.
+def read_header_line(file: BinaryIO, path: Path, kind: str, end: str) -> str:
+    """Return the next line of a header, which ends with the line `end`.
 
     Raises:
         InputError: if the file ends first, or the header is too long.
@@ -79,4 +79,4 @@ def read_header_line(file: BinaryIO, path: Path, kind: str, end: str) -> list[st
         raise InputError(
             f"{path}: expected the header of {kind}, found no {end}; write the file again"
         )
-    return line.decode("latin-1").split()  # comments may be in any encoding
+    return line.decode("latin-1").strip()  # comments may be in any encoding

@@ -18,7 +18,20 @@ ADVICE = "write the file again"
 CLASSIFICATION = "classification"
 FIRST_WIDE_FORMAT = 6  # the first point format whose classification has a byte of its own
 FLAGS = ("synthetic", "key_point", "withheld")  # the other bits of the byte in earlier formats
+COMMENTS = ("amvnet", 1)  # the user id and the record id of the record with comments
 CHUNK = 1_000_000  # the points that are read at a time
+
+
+def read_comments(path: Path) -> dict[str, list[str]]:
+    """Return the lines of the record `COMMENTS`; raise InputError if the file is not LAS."""
+    comments: list[str] = []
+    with reading(path, EXPECTED, ADVICE):
+        import laspy
+
+        with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
+            for record in file.header.vlrs.get_by_id(COMMENTS[0], [COMMENTS[1]]):
+                comments += record.record_data.decode("ascii").splitlines()
+    return {"comments": comments}
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:

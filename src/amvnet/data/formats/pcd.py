@@ -25,6 +25,7 @@ from amvnet.data.formats.fields import Fields, read_header_line
 from amvnet.errors import InputError
 
 KIND = "a PCD file"
+COMMENT = "# "  # begins a line of the header
 ADVICE = "write the file again"
 
 # NumPy types by a field's TYPE (a letter) and SIZE (bytes).
@@ -71,11 +72,21 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         )
 
 
+def read_comments(path: Path) -> dict[str, list[str]]:
+    """Return the comments of the header; raise InputError if it has no end."""
+    comments = []
+    with path.open("rb") as file:
+        while not (line := read_header_line(file, path, KIND, "line DATA")).startswith("DATA"):
+            if line.startswith(COMMENT):
+                comments.append(line.removeprefix(COMMENT))
+    return {"comments": comments}
+
+
 def _read_header(file: BinaryIO, path: Path) -> dict[str, list[str]]:
     """Return the header up to DATA: the first word of each line, and its other words."""
     entries: dict[str, list[str]] = {}
     while "DATA" not in entries:
-        words = read_header_line(file, path, KIND, "line DATA")
+        words = read_header_line(file, path, KIND, "line DATA").split()
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
     return entries

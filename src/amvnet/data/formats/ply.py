@@ -29,6 +29,7 @@ TYPES = {
 }
 BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 KIND = "a PLY file"
+COMMENT = "comment "  # begins a line of the header
 ADVICE = "write the file again"
 
 
@@ -107,13 +108,23 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         return fields.read_binary(file, vertex.count, chosen)
 
 
+def read_comments(path: Path) -> dict[str, list[str]]:
+    """Return the comments of the header; raise InputError if it has no end."""
+    comments = []
+    with path.open("rb") as file:
+        while (line := read_header_line(file, path, KIND, "end_header")) != "end_header":
+            if line.startswith(COMMENT):
+                comments.append(line.removeprefix(COMMENT))
+    return {"comments": comments}
+
+
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
     encoding = ""
     elements: list[Element] = []
 
     words: list[str] = []
     while words != ["end_header"]:
-        words = read_header_line(file, path, KIND, "end_header")
+        words = read_header_line(file, path, KIND, "end_header").split()
         keyword = words[0] if words else ""
         if keyword == "format":
             encoding = words[1]

@@ -40,6 +40,12 @@ COLUMN_READERS: dict[str, Callable[[Path, Names], Arrays]] = {
     ".feather": feather.read_columns,
     **dict.fromkeys(TEXT, text.read_columns),
 }
+COMMENT_READERS: dict[str, Callable[[Path], dict[str, list[str]]]] = {
+    ".pcd": pcd.read_comments,
+    ".ply": ply.read_comments,
+    ".las": las.read_comments,
+    ".laz": las.read_comments,
+}
 
 # The files that are read in the process with limits, and the packages that they need.
 PACKAGES: dict[str, tuple[str, ...]] = {
@@ -72,6 +78,19 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     """
     columns: Arrays = _call(COLUMN_READERS[ending], path, ending, wanted)
     return columns
+
+
+def read_comments(path: Path) -> list[str]:
+    """Return the comments in a file of points, in the format that its name ends in.
+
+    Raises:
+        InputError: if the file is broken, or needs a package that is missing.
+    """
+    ending = path.suffix.lower()
+    if ending not in COMMENT_READERS:
+        return []
+    comments: list[str] = _call(COMMENT_READERS[ending], path, ending)["comments"]
+    return comments
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:

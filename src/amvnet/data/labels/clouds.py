@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+
+from amvnet.data.formats import las, pcd, ply
 
 Columns = dict[str, np.ndarray]
 
@@ -25,7 +28,9 @@ MILLIMETRE = 0.001
 FARTHEST = 1_000_000.0  # largest coordinate, metres, from which 32 bits of millimetres reach 0
 
 
-def write_cloud(path: Path, ending: str, columns: Columns, program: str = "amvnet") -> None:
+def write_cloud(
+    path: Path, ending: str, columns: Columns, legend: Sequence[str], program: str = "amvnet"
+) -> None:
     """Write points in the format of an ending.
 
     Args:
@@ -34,25 +39,27 @@ def write_cloud(path: Path, ending: str, columns: Columns, program: str = "amvne
             others. LAS has coordinates in millimetres, lost points (NaN) at 0, 0, 0 (in map
             coordinates, at their lowest corner), and the class as `classification` if all ids are
             below 256, else as a dimension of its own.
+        legend: the lines that name the classes (`legend_of`).
         program: what LAS says of the program that wrote the file.
     """
     if ending == ".ply":
-        _write_ply(path, columns)
+        _write_ply(path, columns, legend)
     elif ending == ".pcd":
-        _write_pcd(path, columns)
+        _write_pcd(path, columns, legend)
     else:
-        _write_las(path, columns, program, packed=ending == ".laz")
+        _write_las(path, columns, legend, program, packed=ending == ".laz")
 
 
-def _write_ply(path: Path, columns: Columns) -> None:
+def _write_ply(path: Path, columns: Columns, legend: Sequence[str]) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns['x'])}"]
     for name, values in columns.items():
         header.append(f"property {PLY_TYPES[values.dtype.str[1:]]} {name}")  # without byte order
+    header += [ply.COMMENT + line for line in legend]
     header.append("end_header\n")
     path.write_bytes("\n".join(header).encode("ascii") + _records(columns))
 
 
-def _write_pcd(path: Path, columns: Columns) -> None:
+def _write_pcd(path: Path, columns: Columns, legend: Sequence[str]) -> None:
     """Write a binary PCD, with the colours packed as PCL packs them."""
     red, green, blue = (columns[name].astype(np.uint32) for name in COLORS)
     fields = {}
@@ -65,6 +72,7 @@ def _write_pcd(path: Path, columns: Columns) -> None:
     count = len(columns["x"])
     header = [
         PCD_HEADER,
+        *(pcd.COMMENT + line for line in legend),
         f"FIELDS {' '.join(fields)}",
         f"SIZE {' '.join(str(values.dtype.itemsize) for values in fields.values())}",
         f"TYPE {' '.join(values.dtype.kind.upper() for values in fields.values())}",
@@ -80,7 +88,9 @@ def _records(columns: Columns) -> bytes:
     return np.rec.fromarrays(list(columns.values()), dtype=fields).tobytes()
 
 
-def _write_las(path: Path, columns: Columns, program: str, packed: bool) -> None:
+def _write_las(
+    path: Path, columns: Columns, legend: Sequence[str], program: str, packed: bool
+) -> None:
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
@@ -98,6 +108,9 @@ def _write_las(path: Path, columns: Columns, program: str, packed: bool) -> None
     header.generating_software = program
     header.global_encoding.wkt = True
     header.vlrs.append(WktCoordinateSystemVlr(LOCAL_COORDINATES))
+    user, record = las.COMMENTS
+    lines = "\n".join(legend).encode("ascii")
+    header.vlrs.append(laspy.VLR(user, record, "classes of the labels", lines))
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name, values.dtype) for name, values in others.items()]
     )

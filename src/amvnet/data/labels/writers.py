@@ -11,6 +11,7 @@ import numpy as np
 from amvnet.data.formats.registry import check_packages
 from amvnet.data.labels.clouds import COLORS, PCD_HEADER, write_cloud
 from amvnet.data.labels.ids import check_count, write_array, write_ids
+from amvnet.data.labels.legend import legend_of
 from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -72,6 +73,8 @@ def write_scan_labels(
     - `pcd` (binary): the same, with the colours packed in rgb.
     - `las`, `laz`: the same, as `write_cloud` describes it.
 
+    Files of points also name the classes, as `legend` describes it.
+
     Args:
         stem: the path without an ending; `.` and the kind are added.
         xyz: (N, 3) the unchanged coordinates of the scan's file, metres. `label` and `npy` use
@@ -101,7 +104,7 @@ def write_scan_labels(
         columns["class"] = raw.astype(np.int32)
         if uncertain is not None:
             columns["uncertain"] = np.asarray(uncertain).astype(np.uint8)
-        write_cloud(part, path.suffix, columns)
+        write_cloud(part, path.suffix, columns, legend_of(taxonomy))
     return path
 
 

@@ -71,6 +71,7 @@ class Editor {
     });
     // A label file needs the ids that files have, and a label for every point of the scan.
     byId("edit").hidden = !about.sources.length || !about.raw || Boolean(scan.note);
+    byId("box-title").textContent = byId("edit").hidden ? "Box" : "Box, correct labels";
     byId("undo").disabled = this.before.at(-1)?.scan !== scan;
     byId("save").disabled = !scan.planes[CORRECTED];
   }

@@ -121,7 +121,7 @@ class Panel {
       const { scored, wrong } = key === "truth" ? { scored: 0 } : errorsOf(scan, key);
       return row("button", null, title, scored ? share(scored - wrong, scored) : "");
     };
-    byId("right").hidden = !scan.planes.truth || !predictions.length;
+    byId("correct").hidden = !scan.planes.truth || !predictions.length;
     choices(byId("labels"), possible.labels, look.labels, make, (labels) => this.change({ labels }));
   }
 
@@ -136,7 +136,7 @@ class Panel {
     const { scored, wrong } = errorsOf(scan, look.labels);
     const rows = [
       row("div", about.marks.wrong, "wrong", share(wrong, scored)),
-      row("div", about.marks.right, "right", share(scored - wrong, scored)),
+      row("div", about.marks.correct, "correct", share(scored - wrong, scored)),
       row("div", about.marks.unscored, "no class in truth", counted(scan.count - scored)),
     ];
     return element("div", { name: "rows", children: rows });

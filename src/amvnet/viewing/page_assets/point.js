@@ -44,7 +44,8 @@ function describe(i, scan) {
     const doubt = planes.uncertain[i] ? ", uncertain" : "";
     lines.push(["disagreement", `${(planes.disagreement[i] / 255).toFixed(2)}${doubt}`]);
   }
-  lines.push(["x, y, z", [x, y, z].map((value) => value.toFixed(2)).join(", ") + " m"]);
+  const inFile = [x, y, z].map((value, axis) => (value + (scan.origin?.[axis] ?? 0)).toFixed(2));
+  lines.push(["x, y, z", `${inFile.join(", ")} m`]);
   lines.push(["distance", `${Math.hypot(x, y, z).toFixed(1)} m`]);
   lines.push(["intensity", (planes.intensity[i] / 255).toFixed(2)]);
   const rows = lines.map(([name, ...found]) =>

@@ -14,7 +14,7 @@ layout(location = 5) in uint uncertain;
 uniform mat4 matrix;
 uniform vec3 center, unit, low, high;  // low, high: the corners of the box
 uniform vec2 range;
-uniform vec3 right, wrong, unscored;
+uniform vec3 correct, wrong, unscored;
 uniform float size, smallest;
 uniform int mode, only;
 uniform sampler2D classes;  // the colour of each class; its alpha is 0 if the class is hidden
@@ -31,7 +31,7 @@ void main() {
   vec4 own = texelFetch(classes, ivec2(int(label), 0), 0);
   bool scored = truth > 0u, missed = scored && label != truth, doubted = uncertain > 0u;
   color = own.rgb;
-  if (mode == 1) color = missed ? wrong : scored ? right : unscored;
+  if (mode == 1) color = missed ? wrong : scored ? correct : unscored;
   if (mode == 2) color = ramped(disagreement);
   if (mode == 3) color = ramped(at.z);
   if (mode == 4) color = ramped(intensity);
