@@ -12,6 +12,7 @@ import webbrowser
 from functools import partial
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -131,6 +132,11 @@ def test_a_path_is_segmented_as_by_predict(tmp_path: Path, segmenter: Segmenter)
     assert "assumed intensity" in alone.assumed
     assert len(alone) == len(POINTS)
     fails(lambda: segmenter(scans), "2", "Segmenter.each")
+    paths: Any = [scans / "a.pcd", str(scans / "b.pcd")]
+    for wrong in (partial(segmenter, paths), lambda: segmenter.many([*paths])):
+        fails(wrong, "scan: expected points", "a.pcd", "Segmenter.each")
+    for one, other in zip(segmenter.each(paths), results, strict=True):
+        assert np.array_equal(one.labels, other.labels)
 
 
 def test_a_scan_of_a_dataset_keeps_its_labels(tmp_path: Path, segmenter: Segmenter) -> None:
@@ -180,6 +186,10 @@ def test_counts_masks_and_points_are_of_the_labels(result: Segmentation) -> None
         assert result.mask(name).sum() == count == (result.labels == index).sum()
     np.testing.assert_array_equal(result.mask(*counts), np.ones(len(result), bool))
     assert not result.mask().any()
+    two = list(counts)[:2]
+    np.testing.assert_array_equal(result.mask(two), result.mask(*two))
+    np.testing.assert_array_equal(result.mask(np.array(two)), result.mask(*two))
+    fails(lambda: result.mask(["cat"]), "'cat'", "did you mean car")
     fails(lambda: result.mask("cat"), "'cat'", "did you mean car")
 
 
@@ -295,6 +305,7 @@ def test_descriptions_are_short(segmenter: Segmenter, result: Segmentation) -> N
 
 SCRIPT = """
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 

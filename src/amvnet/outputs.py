@@ -18,7 +18,7 @@ from amvnet.errors import InputError
 from amvnet.files import LONGEST_NAME
 
 # The format of the labels of a scan file.
-FormatName = Literal["label", "npy", "ply", "pcd", "las", "laz"]
+FormatName = Literal["label", "npy", "csv", "ply", "pcd", "las", "laz"]
 HEAD = 4096  # length of the beginning of a file that is compared with a signature, bytes
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import resource
 import struct
@@ -29,7 +30,7 @@ from fixtures.scan_writers import some_points, write_bag1, write_pcd
 
 COUNT = 60
 LOST = 7  # the index of a point with NaN
-WITH_POINTS = ("ply", "pcd", "las", "laz")  # kinds of files with coordinates
+WITH_POINTS = ("csv", "ply", "pcd", "las", "laz")  # kinds of files with coordinates
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,22 @@ def read_npy(path: Path) -> LabelFile:
     return LabelFile(raw)
 
 
+def read_csv(path: Path) -> LabelFile:
+    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    raw = np.array([int(row["class"]) for row in rows], np.uint32)
+    for row in rows:
+        known = dict(zip(SEMANTICKITTI.train_to_raw, SEMANTICKITTI.names, strict=True))
+        assert row["name"] in (*NUSCENES.classes, known.get(int(row["class"])))
+    xyz = np.array([[float(row[axis]) for axis in "xyz"] for row in rows]).reshape(-1, 3)
+    uncertain = np.array([row.get("uncertain") == "1" for row in rows])
+    has_uncertain = bool(rows) and "uncertain" in rows[0]
+    return LabelFile(raw, xyz, None, uncertain if has_uncertain else None)
+
+
 READERS: dict[str, Callable[[Path], LabelFile]] = {
     "label": lambda path: LabelFile(np.fromfile(path, "<u4")),
     "npy": read_npy,
+    "csv": read_csv,
     "ply": read_ply,
     "pcd": read_pcd,
     "las": read_las,
@@ -110,7 +124,7 @@ def check_coordinates(kind: str, xyz: np.ndarray | None, expected: np.ndarray) -
     if kind.startswith("la"):
         np.testing.assert_allclose(np.nan_to_num(xyz), np.nan_to_num(expected), atol=6e-4)
     else:
-        np.testing.assert_array_equal(xyz, expected)
+        np.testing.assert_array_equal(xyz.astype(expected.dtype), expected)
 
 
 # --- the files ---
@@ -138,7 +152,8 @@ def test_other_libraries_read_the_files(kind: str, with_uncertain: bool, tmp_pat
         return
 
     check_coordinates(kind, content.xyz, xyz)
-    np.testing.assert_array_equal(content.colors, np.array(class_colors(SEMANTICKITTI))[ids])
+    if kind != "csv":
+        np.testing.assert_array_equal(content.colors, np.array(class_colors(SEMANTICKITTI))[ids])
     if with_uncertain:
         np.testing.assert_array_equal(content.uncertain, uncertain)
     else:

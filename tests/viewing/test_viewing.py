@@ -355,7 +355,7 @@ def test_labels_are_read_with_the_classes_that_are_named(world: Path, tmp_path: 
     assert planes["labels"].tolist() == ids.tolist()
 
 
-@pytest.mark.parametrize("kind", with_full(["label", "npy", "ply"], ["label", "npy"]))
+@pytest.mark.parametrize("kind", with_full(["label", "npy", "csv", "ply"], ["label", "npy"]))
 def test_labels_of_every_format_of_predict_are_shown(
     world: Path, tmp_path: Path, kind: str
 ) -> None:

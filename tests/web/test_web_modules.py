@@ -22,7 +22,7 @@ from amvnet import scan as scans
 from amvnet.config import schema
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import PolarViewConfig
-from amvnet.data.formats import cloud, fields, pcd, raw, rows
+from amvnet.data.formats import cloud, fields, numpy_files, pcd, raw, rows
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
@@ -697,6 +697,7 @@ NUMBERS: dict[str, dict[str, float]] = {
     "method/verdict.js": {"FEW": verdict.FEW_UNCERTAIN, "SMALLEST": segmentation.SMALLEST},
     "reading/cloud.js": {"MAX_MISSING": cloud.MAX_MISSING_SHARE, "MAX_RINGS": cloud.MAX_RINGS},
     "reading/fields.js": {"LONGEST_HEADER": fields.HEADER},
+    "reading/npy.js": {"TRANSPOSED_ROWS": numpy_files.TRANSPOSED_ROWS},
     "reading/pcd.js": {
         "LONGEST_REPETITION": pcd.LONGEST_REPETITION,
         "REPETITION_CODE": pcd.REPETITION_CODE,
@@ -862,6 +863,7 @@ def test_other_arrays_are_refused_in_one_line(tmp_path: Path) -> None:
     labels = np.arange(3000) % 7 * 1000
     arrays = {
         "transposed": points.T,
+        "transposed_image": np.moveaxis(points.reshape(50, 60, 4), -1, 0),
         "image": points.reshape(50, 60, 4),
         "fields": points.view([(name, "f4") for name in "xyzi"]),
         "text": np.array(["a", "b"]),
@@ -878,10 +880,14 @@ def test_other_arrays_are_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "magic.npy").write_bytes(whole[:8])
     (tmp_path / "code.npy").write_bytes(whole.replace(b"'<f8'", b"exit()"))
     paths = sorted(tmp_path.glob("*.npy"))
-    assert len(paths) == 11
+    assert len(paths) == 12
     for path, page in zip(paths, run_page([Case(path) for path in paths], tmp_path), strict=True):
         assert page["error"].startswith(f"{path.name}: expected "), page
         assert "\n" not in page["error"]
+        if path.stem.startswith("transposed"):
+            with pytest.raises(InputError) as caught:
+                read_file(path, ".npy", UNKNOWN)
+            assert page["error"] == str(caught.value).replace(str(path), path.name)
 
 
 def broken_files(folder: Path) -> list[Path]:

@@ -205,8 +205,8 @@ class LabelChoice:
     """a point goes to the head if the cosine similarity of the two networks' probabilities is at
     most this value, in [0, 1]; a lower value takes less time; default: the value in the weights."""
     format: FormatName = "label"
-    """the format of the labels of scan files: raw ids (label, npy), or coloured points (ply, pcd,
-    las, laz)."""
+    """the format of the labels of scan files: raw ids (label, npy), a table of the points (csv), or
+    coloured points (ply, pcd, las, laz)."""
     classes: str | None = None
     """other classes, to which the classes of the weights are mapped: coarse, lidog, or a YAML
     file."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -47,6 +48,7 @@ def array_cloud(points: AnyArray, columns: str | Sequence[str] | None = None) ->
     """
     names = parse_layout(columns).columns
     with errors_of("scan"):
+        _check_no_path(points)
         array = as_array(points, EXPECTED)
     if array.dtype.names is None:
         _check_shape(array)
@@ -87,6 +89,16 @@ def array_scan(cloud: Cloud, trained: TrainedIntensity | None = None) -> Scan:
         table[:, :3] = cloud.xyz
         table[:, 3] = intensity
     return check_scan(Scan(table, ring=cloud.ring))
+
+
+def _check_no_path(points: AnyArray) -> None:
+    """Raise InputError if someone gives a path, or a list of paths, as points."""
+    first = points[0] if isinstance(points, list | tuple) and points else points
+    if isinstance(first, Path | str):
+        raise InputError(
+            f"expected {EXPECTED}, found the path {str(first)!r}; segment files with "
+            "Segmenter.each, or read them with amvnet.read"
+        )
 
 
 def _check_shape(array: np.ndarray) -> None:

@@ -92,20 +92,26 @@ class Segmentation:
         order = np.argsort(-counts, kind="stable")
         return {self.class_names[index]: int(counts[index]) for index in order if counts[index]}
 
-    def mask(self, *names: str) -> NDArray[np.bool_]:
+    def mask(self, *names: str | Iterable[str]) -> NDArray[np.bool_]:
         """Return (N,) bool: which points have one of these classes, such as "car".
+
+        Args:
+            names: names of classes, and lists of names.
 
         Raises:
             InputError: if there is no such class.
         """
-        for name in names:
+        wanted: list[str] = []
+        for entry in names:
+            wanted.extend([entry] if isinstance(entry, str) else entry)
+        for name in wanted:
             if name not in self.class_names:
                 advice = f"name one of {', '.join(self.class_names)}"
                 raise InputError(
                     f"expected a class of the result, found {name!r}"
-                    + did_you_mean(name, self.class_names, advice)
+                    + did_you_mean(str(name), self.class_names, advice)
                 )
-        return np.isin(self.labels, [self.class_names.index(name) for name in names])
+        return np.isin(self.labels, [self.class_names.index(name) for name in wanted])
 
     @property
     def has_two_networks(self) -> bool:
@@ -185,8 +191,8 @@ class Segmentation:
         """Write the labels, in the format that the path's ending names; replace earlier labels.
 
         `.label` and `.npy` hold the raw ids. `.ply`, `.pcd`, `.las` and `.laz` hold the points,
-        coloured by class, with their `points` as coordinates. `write_scan_labels` describes the
-        formats.
+        coloured by class, with their `points` as coordinates; `.csv` holds a table of them.
+        `write_scan_labels` describes the formats.
 
         Returns:
             The path.

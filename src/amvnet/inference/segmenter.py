@@ -139,7 +139,7 @@ class Segmenter:
         """Segment several scans in one pass of the networks, which suits a GPU.
 
         Args:
-            scans: arrays or `Scan`s, as `__call__` takes them as `points`; paths are not taken.
+            scans: arrays or `Scan`s, as `__call__` takes them as `points`; `each` takes paths.
             yaws: the yaw of each scan, as `__call__` takes it; by default 0.
 
         Raises:
@@ -173,14 +173,16 @@ class Segmenter:
             results.append(replace(result, origin=origin))
         return results
 
-    def each(self, path: Path | str, topic: str | None = None) -> Iterator[Segmentation]:
+    def each(
+        self, path: Path | str | Sequence[Path | str], topic: str | None = None
+    ) -> Iterator[Segmentation]:
         """Segment the scans of a file, a bag, a folder of these, or a dataset, one after the other.
 
         Scans of files and bags are normalised to the weights, as `amvnet predict` normalises them.
         All scans of one folder or bag are normalised alike.
 
         Args:
-            path: a file, folder or dataset, as `amvnet predict` takes it as INPUT.
+            path: a file, folder or dataset, as `amvnet predict` takes it as INPUT; or several.
             topic: the topic to read in bags; by default the only one with scans.
 
         Returns:
@@ -191,7 +193,9 @@ class Segmenter:
                 segmented.
         """
         options = ScanOptions(topic=topic, layout=parse_layout(self.columns))
-        return map(self._segment_input, self._list(find_inputs([str(path)], options)))
+        paths = [path] if isinstance(path, Path | str) else path
+        inputs = find_inputs(list(map(str, paths)), options)
+        return map(self._segment_input, self._list(inputs))
 
     def _list(self, inputs: Inputs) -> list[InputScan]:
         """Return the scans of some inputs, normalised to the weights when they are read."""

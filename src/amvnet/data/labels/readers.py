@@ -145,9 +145,14 @@ def _read_integers(path: Path, count: int) -> np.ndarray:
 
 
 def _read_numbers(path: Path) -> np.ndarray:
-    """Read a text with a number in each line; the first line may be a title."""
+    """Read a text with a number in each line; the first line may be a title.
+
+    A table whose first line names x, y and z has a column of labels.
+    """
     with path.open(encoding="utf-8-sig") as file:
         first = file.readline()
+        if {"x", "y", "z"} <= set(first.strip().split(",")):
+            return read_columns(path, path.suffix.lower(), {KEY: COLUMNS})[KEY]
         with suppress(ValueError):  # a title or a comment is not read again
             float(first)
             file.seek(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 from typing import get_args
@@ -9,7 +10,7 @@ from typing import get_args
 import numpy as np
 
 from amvnet.data.formats.registry import check_packages
-from amvnet.data.labels.clouds import COLORS, PCD_HEADER, write_cloud
+from amvnet.data.labels.clouds import COLORS, PCD_HEADER, Columns, write_cloud
 from amvnet.data.labels.ids import check_count, write_array, write_ids
 from amvnet.data.labels.legend import legend_of
 from amvnet.data.palette import class_colors
@@ -36,6 +37,7 @@ SIGNATURES = {
     ".label": Signature("a file of labels", _IDS, unit=4),
     ".bin": Signature("a file of labels", _IDS),
     ".npy": Signature("an array of labels", _ARRAY % b"[<>|][iu]\\d"),
+    ".csv": Signature(_CLOUD, rb"x,y,z,class,name[,\n]"),
     ".ply": Signature(_CLOUD, _PLY),
     ".pcd": Signature(_CLOUD, re.escape(PCD_HEADER).encode()),
     ".las": Signature(_CLOUD, _LAS),
@@ -68,6 +70,8 @@ def write_scan_labels(
 
     - `label`: only raw ids, uint32, as in SemanticKITTI.
     - `npy`: the same ids as an (N,) array.
+    - `csv`: x, y, z, class (raw id), name (of the class), uncertain (0 or 1), in a line for each
+      point below the names of these columns.
     - `ply` (binary): x, y, z, red, green, blue, class (raw id), uncertain (0 or 1). Coordinates are
       float32, or float64 if float32 would be off by more than half a millimetre. NaN stays NaN.
     - `pcd` (binary): the same, with the colours packed in rgb.
@@ -99,6 +103,13 @@ def write_scan_labels(
             return path
 
         columns = _coordinates(xyz)
+        if kind == "csv":
+            columns |= {"class": raw, "name": np.asarray(taxonomy.names)[ids]}
+            if uncertain is not None:
+                columns["uncertain"] = np.asarray(uncertain).astype(np.uint8)
+            _write_table(part, columns)
+            return path
+
         colors = np.asarray(class_colors(taxonomy), dtype=np.uint8)[ids]
         columns |= dict(zip(COLORS, colors.T, strict=True))
         columns["class"] = raw.astype(np.int32)
@@ -113,6 +124,14 @@ def write_uncertain(path: Path, uncertain: np.ndarray) -> Path:
     with atomic_write(path) as part:
         write_array(part, np.asarray(uncertain, dtype=bool))
     return path
+
+
+def _write_table(path: Path, columns: Columns) -> None:
+    """Write columns (N,) as a table with commas; numbers have as many digits as tell them apart."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(columns)
+        table.writerows(zip(*(values.astype(str) for values in columns.values()), strict=True))
 
 
 @np.errstate(invalid="ignore", over="ignore")
