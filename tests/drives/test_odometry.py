@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -107,9 +108,31 @@ def test_ways_that_a_car_takes_have_no_jump() -> None:
         check_steps(some, names[: len(some)], *NAMED)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_fit_says_how_exact_poses_are(seed: int) -> None:
+    """The alignment finds the true motion, of which poses are off by metres and degrees."""
+    motion = motion_of(metres=3)
+    pair = Pair(posts(seed=seed), moved_back(posts(seed=seed), motion), motion)
+    fit = check_fit([pair], *NAMED)
+    assert fit is not None
+    assert fit.distance == pytest.approx(0, abs=1e-9) == fit.shift
+    assert not fit.is_doubtful
+
+    wrong = replace(pair, motion=motion @ motion_of(degrees=0.6))
+    fit = check_fit([wrong], *NAMED)
+    assert fit is not None
+    assert fit.is_doubtful
+    assert fit.least == pytest.approx(0, abs=0.01)
+    reach = np.median(np.linalg.norm(posts(seed=seed), axis=1))
+    assert fit.shift == pytest.approx(np.radians(0.6) * reach, rel=0.2)
+
+    wrong = replace(pair, motion=motion @ motion_of(metres=-0.1, degrees=1.5))
+    fails(lambda: check_fit([wrong], *NAMED), "poses", "if they are aligned", "advice")
+
+
 def test_scans_without_points_to_compare_fit_any_poses() -> None:
     none = np.empty((0, 3))
-    check_fit([], *NAMED)
+    assert check_fit([], *NAMED) is None
     check_fit(
         [Pair(none, posts(), motion_of(4)), Pair(posts(), none, motion_of(4))], "poses", "advice"
     )

@@ -18,6 +18,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.poses import Poses
 from amvnet.drives.consensus import REACH
 from amvnet.drives.odometry import Odometry, Pair, check_fit
+from amvnet.errors import InputError
 from amvnet.inference import drive as drive_module
 from amvnet.inference.drive import Drives, find_poses
 from amvnet.inference.listing import list_inputs
@@ -254,6 +255,41 @@ def test_poses_that_do_not_fit_are_one_line_and_nothing_is_written(
     np.save(tmp_path / "poses.npy", spoil(POSES))
     refused(predict(world, tmp_path / "out", f"--poses {tmp_path}/poses.npy"), "poses.npy")
     assert not (tmp_path / "out").exists()
+
+
+def turned(poses: Poses) -> Poses:
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("z", 4, degrees=True).as_matrix()
+    return poses @ turn
+
+
+def in_whole_metres(poses: Poses) -> Poses:
+    poses = poses.copy()
+    poses[:, :3, 3] = np.round(poses[:, :3, 3])
+    return poses
+
+
+def without_rotations(poses: Poses) -> Poses:
+    poses = poses.copy()
+    poses[:, :3, :3] = np.eye(3)
+    return poses
+
+
+@pytest.mark.parametrize("spoil", [turned, in_whole_metres, without_rotations])
+def test_poses_that_are_less_exact_than_the_scans_do_not_pass_in_silence(
+    world: Path, tmp_path: Path, spoil: Callable[[Poses], Poses]
+) -> None:
+    scans, _ = list_inputs([f"{world}/data"])
+    lines: list[str] = []
+    np.save(tmp_path / "poses.npy", POSES)
+    find_poses(scans, tmp_path / "poses.npy", report=lines.append)
+    assert len(lines) == 1
+    np.save(tmp_path / "poses.npy", spoil(POSES))
+    try:
+        find_poses(scans, tmp_path / "poses.npy", report=lines.append)
+    except InputError as error:
+        lines.append(str(error))
+    assert "apart" in lines[-1]
 
 
 def test_poses_that_were_turned_by_a_calibration_say_so(world: Path, tmp_path: Path) -> None:

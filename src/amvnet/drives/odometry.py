@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from amvnet.data.poses import Poses
 from amvnet.errors import InputError
@@ -16,6 +17,13 @@ PAIRS = 8  # number of pairs that are compared, evenly spaced over the drive
 CHECKED_POINTS = 2000  # number of points of a scan that are compared
 NEAREST, FARTHEST = 2.0, 30.0  # distances of the points that are compared, metres
 CLOSE = 0.15  # median distance up to which poses fit, metres
+# The alignment of two scans by ICP moves points by their nearest ones; the others may have moved.
+ALIGNING_STEPS = 12
+ALIGNED_SHARE = 0.7
+# Aligning true poses moves points by up to 0.13 m and divides the distance by up to 1.09; poses in
+# whole metres or turned by 3 degrees by 0.18 to 0.69 m and by 1.23 to 3.4 (docs/log.md).
+DOUBTFUL_SHIFT, DOUBTFUL_RATIO = 0.1, 1.2
+WRONG_SHIFT, WRONG_RATIO = 0.25, 2.0
 OTHERS = (0.0, 0.8, 1.25)  # multiples of a motion; if it is true, it brings the scans closer
 # With true poses, the median distance is at most 0.62 of the least distance under the other
 # motions, and with wrong poses at least 1.1 times that distance (docs/log.md).
@@ -102,17 +110,47 @@ def check_steps(poses: Poses, names: Sequence[str], name: str, advice: str) -> N
         )
 
 
-def check_fit(pairs: Iterable[Pair], name: str, advice: str) -> None:
-    """Check that poses fit the scans: that the surfaces of two scans meet in the world.
+@dataclass(frozen=True)
+class Fit:
+    """How well poses fit the scans: medians over pairs of scans, metres.
+
+    Attributes:
+        distance: of the points of one scan to the nearest ones of the other, moved by the poses.
+        least: the same distance, after each pair was aligned.
+        shift: by how much this moved the points.
+    """
+
+    distance: float
+    least: float
+    shift: float
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the poses are less exact than the scans allow."""
+        return self.shift > DOUBTFUL_SHIFT and self.distance > DOUBTFUL_RATIO * self.least
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether so little is gained by the poses that others are better."""
+        return self.shift > WRONG_SHIFT and self.distance > WRONG_RATIO * self.least
+
+    def __str__(self) -> str:
+        return f"their points {self.distance:.2f} m apart, {self.least:.2f} m if they are aligned"
+
+
+def check_fit(pairs: Iterable[Pair], name: str, advice: str) -> Fit | None:
+    """Return how well poses fit the scans, whose surfaces should meet in the world.
 
     With wrong poses, each wall is seen twice, and another motion brings the scans closer together:
-    none, a shorter one or a longer one. The message begins with `name` and ends with `advice`.
+    none, a shorter one, a longer one, or that of an alignment. The message begins with `name` and
+    ends with `advice`.
+
+    Returns:
+        The fit, or None if the scans do not tell.
 
     Raises:
         InputError: if the poses do not fit.
     """
-    from scipy.spatial import KDTree
-
     distances = []
     for pair in pairs:
         before = _compared(pair.before)
@@ -121,11 +159,13 @@ def check_fit(pairs: Iterable[Pair], name: str, advice: str) -> None:
         if len(before) and len(after):
             tree = KDTree(before)
             moved = [after @ turn.T + step for turn, step in _motions(pair.motion)]
-            distances.append([np.median(tree.query(points)[0]) for points in moved])
+            moved.append(_aligned(tree, moved[0]))
+            shift = np.median(np.linalg.norm(moved[-1] - moved[0], axis=1))
+            distances.append([shift, *(np.median(tree.query(points)[0]) for points in moved)])
     if not distances:
-        return
+        return None
 
-    given, *others = np.median(distances, axis=0)
+    shift, given, *others, aligned = np.median(distances, axis=0).tolist()
     least = min(others)
     if given > max(CLOSE, LARGEST_RATIO * least):
         factor = OTHERS[others.index(least)]
@@ -134,6 +174,26 @@ def check_fit(pairs: Iterable[Pair], name: str, advice: str) -> None:
             f"{name}: expected poses under which the scans meet, found their points {given:.2f} m "
             f"apart, and {least:.2f} m with {motion}; {advice}"
         )
+    fit = Fit(given, aligned, shift)
+    if fit.is_wrong:
+        raise InputError(
+            f"{name}: expected poses under which the scans meet, found {fit}; {advice}"
+        )
+    return fit
+
+
+def _aligned(tree: KDTree, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (M, 3) moved by ICP, so that most of them are near the points of a tree."""
+    for _ in range(ALIGNING_STEPS):
+        distance, index = map(np.asarray, tree.query(points))
+        is_near = distance <= np.quantile(distance, ALIGNED_SHARE)
+        source = points[is_near]
+        target = tree.data[index[is_near]]
+        centre, goal = source.mean(axis=0), target.mean(axis=0)
+        left, _, right = np.linalg.svd((source - centre).T @ (target - goal))
+        right[2] *= np.linalg.det(left @ right)  # a rotation, no reflection
+        points = (points - centre) @ left @ right + goal
+    return points
 
 
 def _motions(motion: Poses) -> Iterator[tuple[Poses, Poses]]:

@@ -268,9 +268,14 @@ def find_poses(
         check_rigid(poses, name)
         says = f"{name}, by {where}", ADVICE.get(where, OTHER_POSES)
         check_steps(poses, [scan.name for scan in members], *says)
-        check_fit(_pairs(members, poses), *says)
+        fit = check_fit(_pairs(members, poses), *says)
         metres = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
         report(f"{name}: a drive of {counted(len(members), 'scan')}, {metres:.0f} m by {where}")
+        if fit is not None and fit.is_doubtful:
+            report(
+                f"warning: {name}: the poses are less exact than the scans: the scans have {fit}, "
+                "so that less is gained by fusing them; check the time and the place of the LiDAR"
+            )
         found |= {key_of(scan): pose for scan, pose in zip(members, poses, strict=True)}
     return Drives(found, past_only)
 
