@@ -128,11 +128,18 @@ def test_transforms_within_the_robot_may_come_on_tf(tmp_path: Path, stamps: list
     ]
     bag = write_bag(tmp_path / "drive", [*sent, *CLOUDS])
     lines: list[str] = []
-    for topic in ["/odom"] if len(stamps) == 2 else ["/odom", "/tf"]:
+    for topic in ("/odom", "/tf"):
         for pose, time in zip(poses_of(bag, topic, lines), TIMES, strict=True):
             expected = between(times, poses, time) @ ON_BASE @ ON_MOUNT
             np.testing.assert_allclose(pose, expected, atol=1e-4)
     assert not lines
+
+
+def test_a_robot_that_stands_still_is_where_tf_says(tmp_path: Path) -> None:
+    sent = [transform(time, ON_WHEELS, ("odom", "base_link"), "/tf") for time in shaken(0)[0]]
+    bag = write_bag(tmp_path / "drive", [*STATICS, *sent, *CLOUDS])
+    expected = ON_WHEELS @ ON_BASE @ ON_MOUNT
+    np.testing.assert_allclose(poses_of(bag, "/tf"), [expected] * SCANS, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [ODOMETRY, POSE, POSE_WITH_COVARIANCE])

@@ -247,6 +247,8 @@ def test_a_map_is_not_resumed_if_anything_is_other_that_its_scores_depend_on(
     digests = [
         request.digest_of(scans, drives),
         request.digest_of(scans, moved),
+        request.digest_of(scans, replace(drives, past_only=True)),
+        request.digest_of(scans, None),
         request.digest_of(scans[1:], drives),
         replace(request, precision="bfloat16").digest_of(scans, drives),
         replace(request, engine="onnx").digest_of(scans, drives),

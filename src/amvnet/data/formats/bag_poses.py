@@ -116,10 +116,13 @@ class _Transform:
         """Whether it does not change: by its topic, or because /tf has it at a single time."""
         return self.kind == STATIC or (self.kind == TF and not np.ptp(self.rows[:, 0]))
 
-    @property
-    def is_constant(self) -> bool:
-        """Whether it is a transform, not a pose, that is always the same."""
-        return self.kind != GIVEN and not np.ptp(self.rows[:, 1:], axis=0).any()
+    def fixed(self) -> _Transform:
+        """Return it as one that does not change if it is a transform that is always the same.
+
+        Drivers also send transforms within the robot on /tf, again and again.
+        """
+        is_constant = self.kind != GIVEN and not np.ptp(self.rows[:, 1:], axis=0).any()
+        return replace(self, kind=STATIC) if is_constant else self
 
     def at(self, times: NDArray[np.float64]) -> Poses:
         """Return the pose at each time (N, 4, 4), or the only one (1, 4, 4) if it is fixed."""
@@ -146,15 +149,17 @@ def _by_tf(
     name: str, transforms: Sequence[_Transform], frame: str, times: NDArray[np.float64]
 ) -> Poses:
     """Return the poses (N, 4, 4) of a frame in the highest frame above it."""
-    chain = _climb(frame, transforms, times)
-    poses = list(chain.values())[-1]
-    if len(poses) != len(times):
-        raise InputError(
-            f"{name}: expected moving frames above the scans' frame {shown(frame)}, found the "
-            f"chain {', '.join(map(shown, chain))}, in which none moves; choose a topic with "
-            "odometry, or leave --poses out, so that the poses are estimated"
-        )
-    return poses
+    # If none moves, the robot may have stood still.
+    for some in (list(map(_Transform.fixed, transforms)), transforms):
+        chain = _climb(frame, some, times)
+        poses = list(chain.values())[-1]
+        if len(poses) == len(times):
+            return poses
+    raise InputError(
+        f"{name}: expected moving frames above the scans' frame {shown(frame)}, found the "
+        f"chain {', '.join(map(shown, chain))}, in which none moves; choose a topic with "
+        "odometry, or leave --poses out, so that the poses are estimated"
+    )
 
 
 def _by_odometry(
@@ -165,8 +170,7 @@ def _by_odometry(
     report: Reporter,
 ) -> Poses:
     """Return the poses (N, 4, 4) of a frame that is fixed to the frame with odometry."""
-    # Drivers also send transforms within the robot on /tf, again and again.
-    fixed = [replace(item, kind=STATIC) for item in transforms if item.is_constant]
+    fixed = [item for item in map(_Transform.fixed, transforms) if item.is_fixed]
     moving = [item for item in transforms if item.kind == GIVEN]
     if len(moving) != 1:
         pairs = ", ".join(f"{shown(item.child)} in {shown(item.parent)}" for item in moving[:3])
