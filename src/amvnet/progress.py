@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 Progress = Callable[[int, int], None]  # takes the number of things done, and their total
+TitledProgress = Callable[[str], AbstractContextManager[Progress]]  # takes what the things are for
 Reporter = Callable[[str], None]  # takes a line about what happens, such as `print`
 
 QUIET_SECONDS = 20  # time after the start in which no line is due, seconds

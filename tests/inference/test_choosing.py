@@ -97,7 +97,15 @@ def test_the_yaml_file_of_own_scans_describes_the_sensor_that_chooses(tmp_path: 
 
 def test_scans_that_cannot_be_read_choose_as_unknown_lasers(tmp_path: Path) -> None:
     (tmp_path / "scan.bin").write_bytes(b"123")
-    assert find_inputs([str(tmp_path)]).choose_weights(Sensor())[0] == LAST
+    choice = find_inputs([str(tmp_path)]).choose_weights(Sensor())
+    assert choice == (LAST, "as the lasers are unknown")
+
+
+def test_scans_of_several_sensors_in_a_folder_choose_no_lasers(tmp_path: Path) -> None:
+    for index, sensor in enumerate(("vlp16", "hdl32e", "os1-64")):
+        write(tmp_path / f"{index}.npy", sensor)
+    choice = find_inputs([str(tmp_path)]).choose_weights(Sensor())
+    assert choice == (LAST, "as the scans are of several sensors")
 
 
 # ---- labels

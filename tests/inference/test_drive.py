@@ -483,6 +483,38 @@ def test_poses_are_estimated(world: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(poses[:, :3, 3], POSES[:, :3, 3], atol=0.15)
 
 
+class ByTable:
+    """Gives scans in order the poses that they have."""
+
+    def __init__(self) -> None:
+        self._poses = iter(POSES)
+
+    def __call__(self, xyz: np.ndarray) -> Poses:
+        return next(self._poses)
+
+
+def test_the_estimation_of_poses_counts_its_scans(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(drive_module, "Odometry", ByTable)
+    for sequence in ("00", "01"):
+        write_drive(tmp_path / "data", sequence)
+        (tmp_path / f"data/sequences/{sequence}/poses.txt").unlink()
+    counts: list[tuple[int, int]] = []
+    scans, _ = list_inputs([f"{tmp_path}/data"])
+    find_poses(scans, progress=lambda done, total: counts.append((done, total)))
+    assert sorted(set(counts)) == [(done, 2 * SCANS) for done in range(2 * SCANS + 1)]
+    assert counts == sorted(counts)
+
+    monkeypatch.setattr(amvnet.progress, "QUIET_SECONDS", 0)
+    capsys.readouterr()
+    options = f"--weights {world}/w.safetensors --sequences 00 --drive"
+    succeed(f"predict {tmp_path}/data {options} --out {tmp_path}/out")
+    assert f"poses: {SCANS // 2} of {SCANS}" in capsys.readouterr().out
+    succeed(f"evaluate {tmp_path}/data {options}")
+    assert f"poses: {SCANS // 2} of {SCANS}" in capsys.readouterr().out
+
+
 def test_without_poses_and_kiss_icp_one_line_says_what_to_do(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -126,6 +126,23 @@ def test_weights_of_a_run_that_was_stopped_say_so(
     assert "not finished" not in capsys.readouterr().out
 
 
+def test_a_head_without_networks_says_what_is_missing_where(world: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    half = tmp_path / "half.safetensors"
+    save(without(load(world / "w.safetensors"), "polar_net", "point_head"), half)
+    command = f"train {world}/recipe.yaml --data {world}/data --out {run} --stage head"
+    refused(command, f"found no range_net in {run}; train it first, or give --init")
+    found = f"found no polar_net in {run}, "
+    refused(f"{command} --init {half}", f"{found}and --init has only range_net; train it first")
+    other = world / "nuscenes.safetensors"
+    refused(f"{command} --init {other}", f"in {run}, and that of --init has other classes; train")
+
+    (run / "bev").mkdir()
+    (run / "bev" / LAST).touch()
+    unfinished = f"{found}whose stage bev is not finished; finish it with --stage bev --resume"
+    refused(f"{command} --init {half}", unfinished)
+
+
 def test_weights_without_a_head_label_by_the_ensemble_and_say_so(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

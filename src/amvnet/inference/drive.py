@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -263,7 +263,9 @@ def find_poses(
             topic = None if bag is None else bag.odometry()
             other = "" if topic is None else f"; --poses {topic} takes those of the bag"
             report(f"{name}: estimating the poses of {counted(len(members), 'scan')}{other}")
-            poses, where = _estimated(members, progress), ESTIMATE
+            earlier = len(found)  # as many scans have their poses already
+            poses = _estimated(members, lambda done: progress(earlier + done, len(scans)))  # noqa: B023
+            where = ESTIMATE
 
         check_rigid(poses, name)
         says = f"{name}, by {where}", ADVICE.get(where, OTHER_POSES)
@@ -297,18 +299,18 @@ def _recorded(
     return scans[0].poses(scans), DATASET
 
 
-def _estimated(scans: Sequence[InputScan], progress: Progress) -> Poses:
+def _estimated(scans: Sequence[InputScan], count: Callable[[int], None]) -> Poses:
     odometry = Odometry()
     poses = []
     for index, scan in enumerate(scans):
-        progress(index, len(scans))
+        count(index)
         try:
             loaded = scan.load().scan
             pose = odometry(loaded.points[loaded.valid, :3])
             poses.append(pose @ np.linalg.inv(to_file(loaded)))
         except InputError:  # the segmentation reports the broken scan
             poses.append(poses[-1] if poses else np.eye(4))
-    progress(len(scans), len(scans))
+    count(len(scans))
     return np.array(poses)
 
 

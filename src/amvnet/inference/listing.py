@@ -348,7 +348,7 @@ class Inputs:
         if recording.is_mixed or (usual is not None and not usual.frame.is_on_ground(sensor)):
             self._measured[source] = usual
         lasers = SensorGeometry() if usual is None else usual.lasers
-        return weights_for(lasers.override(sensor), classes)
+        return weights_for(lasers.override(sensor), classes, recording.is_mixed)
 
     def scans(
         self,

@@ -15,7 +15,7 @@ from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_ou
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
-from amvnet.progress import Progress, Reporter, no_progress, report_nothing
+from amvnet.progress import Reporter, TitledProgress, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.verdict import Verdict
@@ -34,9 +34,9 @@ def predict(
     make_segmenter: Callable[[], Segmenter],
     output: OutputOptions,
     *,
+    progress: TitledProgress,
     drive: DriveOptions | None = None,
     batch: int = 1,
-    progress: Progress = no_progress,
     report: Reporter = report_nothing,
 ) -> tuple[list[Entry], list[str]]:
     """Segment datasets, scan files, bags and folders of them.
@@ -65,7 +65,8 @@ def predict(
     check_output(scans, output)
     drives = None
     if drive is not None:
-        drives = find_poses(scans, drive.poses, drive.past_only, report=report)
+        with progress("poses") as step:
+            drives = find_poses(scans, drive.poses, drive.past_only, progress=step, report=report)
         table = None if classes is None else classes.table(request.weights.taxonomy)
         drives = replace(drives, table=table)
         request = replace(request, drive=drives.digest)
@@ -78,7 +79,8 @@ def predict(
         at_once=segmenter.at_once,
         drives=drives,
     )
-    return pipeline.run(request.settings, progress)
+    with progress("segmenting") as step:
+        return pipeline.run(request.settings, step)
 
 
 def segment_by(

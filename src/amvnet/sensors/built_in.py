@@ -7,17 +7,21 @@ from amvnet.sensors.lasers import SensorGeometry, describe_lasers
 from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, Sensor
 
 
-def weights_for(lasers: SensorGeometry, classes: Taxonomy | None = None) -> tuple[str, str]:
+def weights_for(
+    lasers: SensorGeometry, classes: Taxonomy | None = None, is_mixed: bool = False
+) -> tuple[str, str]:
     """Return the name of the built-in weights for a sensor, and in words why these.
 
     Args:
         lasers: what is known about the lasers of the sensor.
         classes: the classes of a dataset; weights with other classes are left out if any have them.
+        is_mixed: whether the scans are from several sensors, so that there are no usual lasers.
     """
     names = [name for name in BUILT_IN if classes is None or _has_classes(name, classes)]
     names = names or list(BUILT_IN)
     if lasers.field_of_view is None:
-        return names[-1], "as the lasers are unknown"
+        why = "scans are of several sensors" if is_mixed else "lasers are unknown"
+        return names[-1], f"as the {why}"
     fitting = [name for name in _fitting(lasers) if name in names]
     if fitting:
         return fitting[0], f"trained for such lasers ({describe_lasers(lasers)})"

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
-from amvnet.config.parts import BOTH_NETWORKS
+from amvnet.config.parts import NETWORK_STAGES, PART_OF
 from amvnet.config.schema import HeadTraining
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
@@ -92,13 +92,23 @@ class HeadStage(Stage):
         return self.one_cycle(optimizer, self.config.momentum)
 
 
-def _why_not(init: Weights | None, part: str) -> str:
-    """Return the words that say why a network of the initial weights does not count."""
-    if init is None:
-        return ""
-    if part not in init.parts:
-        return f", and --init has only {', '.join(init.parts)}"
-    return ", and that of --init has other classes"
+def _check_networks(plan: Plan, weights: Weights) -> None:
+    """Raise InputError if a network is missing, and say why that of the folder or of `init` is."""
+    for stage in NETWORK_STAGES:
+        part = PART_OF[stage].name
+        if part in weights.parts:
+            continue
+        why, advice = "", "train it first" if plan.init else "train it first, or give --init"
+        if plan.folder.stages[stage].is_begun:
+            why = f", whose stage {stage} is not finished"
+            advice = f"finish it with --stage {stage} --resume"
+        elif plan.init and part not in plan.init.parts:
+            why = f", and --init has only {', '.join(plan.init.parts)}"
+        elif plan.init:
+            why = ", and that of --init has other classes"
+        raise InputError(
+            f"expected trained networks for the head, found no {part} in {plan.out}{why}; {advice}"
+        )
 
 
 def train_head(plan: Plan, weights: Weights) -> None:
@@ -114,13 +124,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
     folder = plan.folder.stages["head"].path
 
     if plan.scores is None:  # other models have not scored the scans already
-        for part in BOTH_NETWORKS:
-            if part not in weights.parts:
-                advice = "train it first" if plan.init else "train it first, or give --init"
-                raise InputError(
-                    f"expected trained networks for the head, found no {part} in {plan.out}"
-                    f"{_why_not(plan.init, part)}; {advice}"
-                )
+        _check_networks(plan, weights)
 
     # Gather the uncertain points of all scans, with their scores and neighbours.
     gatherer = PointGatherer(plan, weights)

@@ -137,7 +137,8 @@ def _find_drives(
     if processes > 1:
         raise InputError("--drive: expected one process, found several; start it without torchrun")
     scans = [DatasetScan(dataset, record) for record in records]
-    return find_poses(scans, options.poses, options.past_only, report=report)
+    with progress("poses") as step:
+        return find_poses(scans, options.poses, options.past_only, progress=step, report=report)
 
 
 def _check_methods(methods: tuple[MethodName, ...], weights: str, parts: tuple[str, ...]) -> None:

@@ -81,17 +81,16 @@ def predict(
     def make_segmenter() -> Segmenter:
         return load_segmenter(request.weights, request.method, compute, request.tau)
 
-    with progress("segmenting") as step:
-        entries, faults = predict_inputs(
-            found,
-            request,
-            make_segmenter,
-            request.output(Path(out), overwrite, resume, also_read),
-            drive=drive,
-            batch=batch,
-            progress=step,
-            report=report,
-        )
+    entries, faults = predict_inputs(
+        found,
+        request,
+        make_segmenter,
+        request.output(Path(out), overwrite, resume, also_read),
+        progress=progress,
+        drive=drive,
+        batch=batch,
+        report=report,
+    )
 
     if entries:
         show(labelled_table(entries, request.taxonomy))
