@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.starter import write_starter
 
-from fixtures.commands import refused, succeed
+from fixtures.commands import files, refusal, refused, succeed
 from fixtures.own_scans import SCANS, SITES, make_own_scans, own_labels, robot_scans
 from fixtures.scan_writers import write_pcd
 
@@ -101,6 +103,36 @@ def test_a_folder_without_scans_gets_no_file(tmp_path: Path) -> None:
     (tmp_path / "data/scan.pcd").write_text("no scan")
     refused(f"check {tmp_path / 'data'}", "found none that can be read")
     assert not (tmp_path / "data.yaml").exists()
+
+
+@pytest.mark.parametrize("name", ["my data", "a:b", "-dash", "[x]", "ü ✓", "a#b", "{name}", "'\""])
+def test_a_folder_may_have_any_name(tmp_path: Path, name: str) -> None:
+    folder = make_flat(tmp_path / name, 3, "{:04d}.pcd", "{:04d}.npy")
+    line = refusal("check", folder)
+    command = shlex.split(line[line.index("amvnet check") :])
+    succeed(*command[1:])
+
+
+@pytest.mark.parametrize("name", ["a\nb", os.fsdecode(b"a\xff")])
+def test_a_name_that_no_yaml_file_holds_is_refused(tmp_path: Path, name: str) -> None:
+    folder = make_flat(tmp_path / name, 3, "{:04d}.pcd")
+    refused(("check", folder), "printable", "rename")
+    assert files(tmp_path) == {f"{name}/{index:04d}.pcd" for index in range(3)}
+
+
+def test_the_file_of_read_only_data_comes_into_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = make_flat(tmp_path / "shared/data", 3, "{:04d}.pcd", "{:04d}.npy")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != folder.parent)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    refused(f"check {folder}", f"{tmp_path}/work/data.yaml is now the beginning")
+    assert not Path(f"{folder}.yaml").exists()
+    succeed("check data.yaml")
+    before = Path("data.yaml").read_bytes()
+    refused(f"check {folder}", "read-only", "found", "amvnet check data.yaml")
+    assert Path("data.yaml").read_bytes() == before
 
 
 # ---- the split of a single sequence

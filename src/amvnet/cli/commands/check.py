@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -37,7 +38,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
             report(line)
         raise InputError(
             f"{data}: expected a dataset, found scans that no YAML file describes; {path} is now "
-            f"the beginning of one: name its classes, and run amvnet check {path}"
+            f"the beginning of one: name its classes, and run amvnet check {shlex.quote(str(path))}"
         )
     dataset = open_dataset(data)
     recordings = dataset.recordings().values()

@@ -99,14 +99,31 @@ class Found:
 def write_starter(folder: Path) -> tuple[Path, Found]:
     """Write the YAML file of a folder beside it; return its path, and what is in the folder.
 
+    If the place beside it is read-only, the file comes into the current folder.
+
     Raises:
-        InputError: if there is no scan in the folder or below it.
+        InputError: if there is no scan in the folder or below it, a name cannot be in a YAML file,
+            or the file cannot be written.
     """
     folder = folder.absolute()
     found = find_labelled(folder)
     path = folder.with_name(f"{folder.name}{ENDINGS[0]}")
+    text = found.text(folder.name)
+    if not os.access(folder.parent, os.W_OK):
+        path = Path.cwd() / path.name
+        text = found.text(str(folder))
+        if path.exists():
+            raise InputError(
+                f"{folder}: expected no YAML file of this name here, as the folder above is "
+                f"read-only, found {path}; run amvnet check {path.name}, or remove it"
+            )
+    if not (folder.name + text.replace("\n", "")).isprintable():
+        raise InputError(
+            f"{folder}: expected names of printable characters, which a YAML file can hold, found "
+            "others; rename the folders"
+        )
     with atomic_write(path) as part:
-        part.write_text(found.text(folder.name), encoding="utf-8")
+        part.write_text(text, encoding="utf-8")
     return path, found
 
 
