@@ -20,8 +20,9 @@ from rich.console import Console
 from rich.table import Table
 
 import amvnet
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
+from amvnet.data.recordings import ScanFile
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
@@ -29,7 +30,7 @@ from amvnet.scan import Scan
 
 def score(
     dataset: Dataset,
-    records: Sequence[ScanRecord],
+    records: Sequence[ScanFile],
     segmenter: Segmenter,
     intensity: bool,
 ) -> Evaluation:

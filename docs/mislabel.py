@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from amvnet import Scan
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.labels.ids import write_ids
+from amvnet.data.recordings import ScanFile
 from amvnet.evaluation.label_errors import cluster
 
 SHARE = 0.01  # the share of the things that get another class
@@ -54,7 +55,7 @@ def mislabel(data: str, wrong: str, seed: int, alike: bool) -> None:
     np.savez(Path(wrong, "wrong.npz"), things=len(things), **marks)
 
 
-def list_things(dataset: Dataset, records: list[ScanRecord]) -> list[tuple[int, int]]:
+def list_things(dataset: Dataset, records: list[ScanFile]) -> list[tuple[int, int]]:
     """Return (index of the scan, number of the thing) for all labelled things of enough points."""
     things = []
     for index, record in enumerate(records):

@@ -23,13 +23,13 @@ from hypothesis import strategies as st
 from amvnet import files
 from amvnet.cli.commands import demo
 from amvnet.data.class_maps import class_map
+from amvnet.data.datasets.files import ScanFiles
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.find import NamedScan
-from amvnet.data.taxonomy import NUSCENES
+from amvnet.data.recordings import Recording, ScanFile
+from amvnet.data.taxonomy import NUSCENES, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, remove_unfinished
-from amvnet.inference.listing import DatasetScan, FileReader, FileScan, InputScan
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_output
 from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
@@ -45,7 +45,7 @@ from fixtures.tiny import fresh_weights, make_simulation_quick, street, without,
 COUNT = 7  # points of a scan
 
 
-def label(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+def label(inputs: Sequence[ScanFile], scans: Sequence[Scan]) -> list[Segmentation]:
     """Return labels without a network."""
     results = []
     for scan in scans:
@@ -55,8 +55,10 @@ def label(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentati
     return results
 
 
-def write(base: Path, scans: Sequence[InputScan], kind: str = "label") -> None:
-    output = OutputOptions(base / "out", kind, scores=True, uncertain=True, overwrite=True)
+def write(
+    base: Path, scans: Sequence[ScanFile], kind: str = "label", written: Taxonomy | None = None
+) -> None:
+    output = OutputOptions(base / "out", kind, written, scores=True, uncertain=True, overwrite=True)
     check_output(scans, output)
     Pipeline(scans, label, output).run({})
 
@@ -66,10 +68,10 @@ def some_cloud() -> Cloud:
     return Cloud(xyz, np.zeros(COUNT))
 
 
-def named(name: str) -> InputScan:
-    return FileScan(
-        NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud), FileReader(None), NUSCENES
-    )
+def named(name: str, path: Path = Path("scan.bin")) -> ScanFile:
+    recording = Recording("source")
+    scan = ScanFile(name, recording, path, prediction=f"{name}.label", read=some_cloud)
+    return ScanFiles([scan], NUSCENES).records()[0]
 
 
 def set_token(root: Path, token: str) -> None:
@@ -102,8 +104,9 @@ def test_names_of_scans_write_nothing_elsewhere(name: str, kind: str, link: str)
         with suppress(InputError):
             write(base, [scan], kind)
         with suppress(InputError):  # the names are checked once more when a file is written
-            (result,) = label([scan], [scan.load().scan])
-            scan.write_labels(base / "out", scan.load(), result, kind)
+            loaded = scan.load()
+            ids = np.ones(len(loaded), np.uint8)
+            scan.dataset.write_labels(scan, base / "out", loaded, ids, kind=kind)
 
 
 @with_examples(100, token=NAMES, link=LINKS, is_mapped=st.booleans())
@@ -111,8 +114,7 @@ def test_tokens_write_nothing_elsewhere(token: str, link: str, is_mapped: bool) 
     with surroundings(link, make=with_token(token)) as base, suppress(InputError):
         dataset = open_dataset(f"nuscenes:{base}/data")
         written = class_map("coarse").target if is_mapped else None
-        records = dataset.records(dataset.sequences("all"))
-        write(base, [DatasetScan(dataset, record, written) for record in records])
+        write(base, dataset.records(dataset.sequences("all")), written=written)
 
 
 @with_examples(100, name=NAMES, link=LINKS, layout=st.sampled_from(list(MAKERS)))
@@ -153,11 +155,9 @@ def test_scans_among_the_outputs_are_not_changed(
                 (out / link).symlink_to(out / target)
         before = {path: (path.lstat().st_ino, path.read_bytes()) for path in paths}
 
-        scans: list[InputScan] = []
+        scans: list[ScanFile] = []
         for name in ("a", "b", "c/a"):
-            path = paths[len(scans) % len(paths)]
-            scan = NamedScan(name, "source", path, ".bin", some_cloud)
-            scans.append(FileScan(scan, FileReader(None), NUSCENES))
+            scans.append(named(name, paths[len(scans) % len(paths)]))
         output = OutputOptions(out, kind, scores=True, uncertain=True, overwrite=overwrite)
         with suppress(InputError):
             check_output(scans, output)

@@ -37,6 +37,7 @@ class Scan:
         name: the origin of the scan, for messages.
         to_file: (4, 4) moves points that were normalised back into the frame of their file, in
             metres; None if the points lie in this frame.
+        file_xyz: (N, 3) the unchanged coordinates of the scan's file; None if there is none.
         assumed: what was assumed of the sensor when the scan was normalised; empty if it was not.
 
     Raises:
@@ -51,6 +52,7 @@ class Scan:
     source: np.ndarray | None = None
     own: np.ndarray | None = None
     to_file: NDArray[np.float64] | None = None
+    file_xyz: NDArray[np.floating] | None = None
     assumed: str = ""
 
     def __post_init__(self) -> None:
@@ -100,6 +102,7 @@ class Scan:
             row=None if self.row is None else self.row[which],
             source=None if self.source is None else self.source[which],
             own=None if self.own is None else self.own[which],
+            file_xyz=None if self.file_xyz is None else self.file_xyz[which],
         )
 
     @property

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from amvnet.cli.options import LabelledChoice
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.datasets.select import to_train
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 
 from fixtures.commands import fails
@@ -27,7 +28,7 @@ def layout(request: pytest.FixtureRequest, tmp_path: Path) -> Layout:
     return MAKERS[request.param](tmp_path / "set")
 
 
-def first_record(dataset: Dataset, layout: Layout) -> ScanRecord:
+def first_record(dataset: Dataset, layout: Layout) -> ScanFile:
     return dataset.records(layout.sequences[:1])[0]
 
 
@@ -98,7 +99,7 @@ def test_ids_that_do_not_fit_are_not_written(layout: Layout, tmp_path: Path) -> 
     too_few = np.ones(6)
     too_large = np.full(7, 20)
 
-    fails(lambda: dataset.write_prediction(record, tmp_path, too_few), record.points_path, 7)
+    fails(lambda: dataset.write_prediction(record, tmp_path, too_few), record.path, 7)
     fails(lambda: dataset.write_prediction(record, tmp_path, too_large), "20")
     assert not (tmp_path / record.prediction).exists()
 

@@ -14,8 +14,8 @@ import pytest
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from amvnet.data.formats.detect import BAGS, GZIP, named_ending
-from amvnet.data.formats.find import list_scans, read_cloud, scan_stem
+from amvnet.data.formats.detect import BAGS, GZIP, named_ending, scan_stem
+from amvnet.data.formats.find import list_scans, read_cloud
 from amvnet.data.formats.rows import parse_layout
 from amvnet.errors import InputError
 

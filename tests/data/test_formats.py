@@ -777,7 +777,7 @@ def test_every_real_scan_is_read_alone_as_in_its_dataset(name: str, count: int) 
     assert len(records) == count
 
     for record in records:
-        scan = read_scan(record.points_path)
+        scan = read_scan(record.path)
         expected = dataset.read(record, labels=False)
         np.testing.assert_array_equal(scan.points, expected.points)
         assert (scan.ring is None) == (expected.ring is None)

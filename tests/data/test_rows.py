@@ -382,7 +382,7 @@ def test_patterns_of_any_folders_follow_links_once(table: np.ndarray, tmp_path: 
     path.write_text('classes: {a: 1}\nscans: "**/*.bin"\n')
     data = open_dataset(str(path))
     records = data.records(data.sequences("all"))
-    assert [record.points_path for record in records] == expected
+    assert [record.path for record in records] == expected
 
 
 @pytest.mark.parametrize("has_circles", [False, True])
@@ -417,7 +417,7 @@ def test_the_folders_of_a_pattern_are_read_once_for_each_any_folders(
     (tmp_path / "own.yaml").write_text(f'classes: {{a: 1}}\nscans: "{"**/" * 7}*.bin"\n')
     data = open_dataset(str(tmp_path / "own.yaml"))
     (record,) = data.records(data.sequences("all"))
-    assert record.points_path == folder / "0.bin"
+    assert record.path == folder / "0.bin"
     assert find_scans(tmp_path / "**/d/**/d/**/d/**/d/**/*.bin") == [folder / "0.bin"]
 
 

@@ -207,10 +207,10 @@ def test_the_streets_read_the_longest_time_ago_make_room(
     for age, record in enumerate(records[:4]):
         dataset.read(record)
         long_ago = time.time() - 100 * (10 - age)  # only the order matters
-        os.utime(record.points_path.parent, (long_ago, long_ago))
+        os.utime(record.path.parent, (long_ago, long_ago))
     dataset.read(records[0])  # now the latest
 
-    files = records[0].points_path.parent.rglob("*.npy")
+    files = records[0].path.parent.rglob("*.npy")
     size = sum(path.stat().st_size for path in files)
     monkeypatch.setattr(simulated, "CACHE_BYTES", int(3.5 * size))
     dataset.read(records[4])
@@ -238,7 +238,7 @@ def test_the_unfinished_street_of_a_killed_process_is_removed_later(tmp_path: Pa
     dataset = SimulatedStreets(tmp_path)
     first = dataset.records(["1"])[0]
     second = dataset.records(["2"])[0]
-    folder = first.points_path.parent.parent
+    folder = first.path.parent.parent
     for name in ("old", "new"):
         (folder / f".{name}.part/000000").mkdir(parents=True)
     long_ago = time.time() - 2 * simulated.ABANDONED
@@ -253,10 +253,10 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path)
     first, second = dataset.records(["1"])[:2]
     dataset.read(first)
-    (first.points_path / "points.npy").write_bytes(b"")
-    (second.points_path / "labels.npy").unlink()
-    fails(lambda: dataset.read(first), first.points_path, "broken", "delete")
-    fails(lambda: dataset.read(second), second.points_path.parent, "a part of them", "delete")
+    (first.path / "points.npy").write_bytes(b"")
+    (second.path / "labels.npy").unlink()
+    fails(lambda: dataset.read(first), first.path, "broken", "delete")
+    fails(lambda: dataset.read(second), second.path.parent, "a part of them", "delete")
 
 
 @pytest.mark.parametrize("workers", [0, 2])

@@ -20,7 +20,7 @@ from amvnet.drives.world_map import MapBuilder
 from amvnet.errors import InputError
 from amvnet.files import alone_in, digest
 from amvnet.inference import map as mapping
-from amvnet.inference.drive import Drives, key_of
+from amvnet.inference.drive import Drives
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.lidars import Sensor
@@ -242,8 +242,8 @@ def test_a_map_is_not_resumed_if_anything_is_other_that_its_scores_depend_on(
     shutil.copytree(world / "data", tmp_path / "data")
     request = LabellingRequest(fresh_weights(), precision="float32")
     scans, _ = list_inputs([f"{tmp_path}/data"])
-    drives = Drives({key_of(scan): np.eye(4) for scan in scans})
-    moved = Drives({**drives.poses, key_of(scans[3]): 2 * np.eye(4)})
+    drives = Drives(dict.fromkeys(scans, np.eye(4)))
+    moved = Drives({**drives.poses, scans[3]: 2 * np.eye(4)})
     digests = [
         request.digest_of(scans, drives),
         request.digest_of(scans, moved),

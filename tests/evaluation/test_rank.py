@@ -15,8 +15,9 @@ import pytest
 
 import amvnet
 from amvnet import Scan
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.evaluation.label_errors import (
     CELL,
@@ -269,7 +270,7 @@ def test_each_scan_is_read_only_in_its_turn(world: Path, monkeypatch: pytest.Mon
     events: list[str | int] = []
     read = type(dataset).read
 
-    def recorded_read(dataset: Dataset, record: ScanRecord) -> Scan:
+    def recorded_read(dataset: Dataset, record: ScanFile) -> Scan:
         events.append("read")
         return read(dataset, record)
 

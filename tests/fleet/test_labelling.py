@@ -18,12 +18,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amvnet.data.formats.registry import read_file
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.fleet.labelling import IS_FATAL, LabelScans, MeasureSensors, statistics
 from amvnet.fleet.manifest import list_scans
 from amvnet.fleet.results import Results, results_schema
 from amvnet.fleet.storage import Place
-from amvnet.inference.listing import InputScan
 from amvnet.inference.pipeline import Segment
 from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest
@@ -213,7 +213,7 @@ def test_scans_beside_a_fault_are_normalised_as_their_drive(
     def segment_by_a_broken_library(*arguments: Any) -> Segment:
         segment = segment_by(*arguments)
 
-        def fail_at_one(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+        def fail_at_one(inputs: Sequence[ScanFile], scans: Sequence[Scan]) -> list[Segmentation]:
             if any(scan.name == "2" for scan in inputs):
                 raise ZeroDivisionError
             return segment(inputs, scans)

@@ -15,7 +15,7 @@ import pytest
 from pyarrow.fs import FileType, LocalFileSystem
 
 from amvnet.data.formats import find
-from amvnet.data.formats.find import scan_stem
+from amvnet.data.formats.detect import scan_stem
 from amvnet.errors import InputError
 from amvnet.fleet import manifest
 from amvnet.fleet.manifest import NameSet, list_scans, split_name
@@ -44,7 +44,7 @@ def touch(root: Path, *names: str) -> None:
 def test_a_folder_of_drives_is_listed_as_predict_lists_its_files(fleet: Path) -> None:
     expected = []
     for scan in find.list_scans(f"{fleet}/scans/*/*.bin"):
-        expected.append((scan.name, scan.source, str(scan.path)))
+        expected.append((scan.name, scan.recording.name, str(scan.path)))
     assert scans_of([f"{fleet}/scans"]) == expected
 
 

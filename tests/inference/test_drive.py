@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.poses import Poses
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.drives.consensus import REACH
 from amvnet.drives.odometry import Odometry, Pair, check_fit
 from amvnet.errors import InputError
@@ -115,12 +116,15 @@ def test_too_few_or_impossible_poses_are_one_line(
 
 
 def test_networks_see_the_scans_in_reach_from_angles_of_their_own() -> None:
-    keys = [(source, str(index)) for source in ("a", "b") for index in range(2 * REACH + 1)]
-    yaws = Drives(dict.fromkeys(keys, np.eye(4))).yaws
-    of_one = np.sort(np.mod([yaws["a", str(index)] for index in range(2 * REACH + 1)], 2 * np.pi))
-    assert np.diff(of_one, append=of_one[0] + 2 * np.pi).min() > np.pi / (2 * REACH + 1)
-    for source, name in keys:
-        assert yaws[source, name] == yaws["a", name]
+    drives = []
+    for recording in (Recording("a"), Recording("b")):
+        path = Path(recording.name)
+        drives.append([ScanFile(str(index), recording, path) for index in range(2 * REACH + 1)])
+    yaws = Drives(dict.fromkeys([*drives[0], *drives[1]], np.eye(4))).yaws
+    of_one, of_other = ([yaws[scan] for scan in scans] for scans in drives)
+    assert of_one == of_other
+    angles = np.sort(np.mod(of_one, 2 * np.pi))
+    assert np.diff(angles, append=angles[0] + 2 * np.pi).min() > np.pi / (2 * REACH + 1)
 
 
 @pytest.mark.parametrize("seconds", [100.05, 1_700_000_000.25])
@@ -167,6 +171,22 @@ def test_an_interrupted_run_resumes_to_the_same_labels(
 
     succeed(predict(world, tmp_path, "--resume"))
     assert labels_in(tmp_path) == labels_in(world / "labels")
+
+
+def test_scans_of_two_drives_that_alternate_are_fused_each_with_its_own(
+    world: Path, tmp_path: Path
+) -> None:
+    words = []
+    for drive in ("a", "b"):
+        (tmp_path / drive).mkdir()
+        for index, (points, _) in enumerate(drive_scans(6)):
+            points.tofile(tmp_path / f"{drive}/{drive}{index}.bin")
+        words.append([f"{tmp_path}/{drive}/{drive}{index}.bin" for index in range(6)])
+    options = f"--weights {world}/w.safetensors --drive --height {HEIGHT}"
+    one_by_one = [path for pair in zip(*words, strict=True) for path in pair]
+    succeed(f"predict {' '.join(one_by_one)} --out {tmp_path}/one_by_one {options}")
+    succeed(f"predict {tmp_path}/a {tmp_path}/b --out {tmp_path}/apart {options}")
+    assert labels_in(tmp_path / "one_by_one") == labels_in(tmp_path / "apart")
 
 
 def test_a_scan_that_changed_is_labelled_again_with_all_scans_in_its_reach(
@@ -316,9 +336,9 @@ def test_poses_that_were_estimated_are_not_to_be_estimated(
 ) -> None:
     monkeypatch.setattr(drive_module, "_estimated", lambda *_: stretched(POSES))
     scans, _ = list_inputs([f"{world}/data"])
-    monkeypatch.setattr(type(scans[0]), "poses", lambda *_: None)
+    monkeypatch.setattr(type(scans[0].dataset), "poses", lambda *_: None)
     fails(lambda: find_poses(scans), "KISS-ICP", "give poses, or scans that follow")
-    monkeypatch.setattr(type(scans[0]), "poses", lambda *_: stretched(POSES))
+    monkeypatch.setattr(type(scans[0].dataset), "poses", lambda *_: stretched(POSES))
     fails(lambda: find_poses(scans), "the dataset", "correct them")
 
 
@@ -353,10 +373,10 @@ def test_poses_of_ones_own_scans_move_the_points_of_their_files(
     for scan, pose, (points, _) in zip(scans, POSES, drive_scans(), strict=True):
         loaded = scan.load()
         into_world = drives.motion(scan, loaded)
-        found = loaded.scan.points[:, :3] @ into_world[:3, :3].T + into_world[:3, 3]
+        found = loaded.points[:, :3] @ into_world[:3, :3].T + into_world[:3, 3]
         np.testing.assert_allclose(found, points[:, :3] @ pose[:3, :3].T + pose[:3, 3], atol=1e-3)
 
-    part = scans[5].poses(scans[5:7])
+    part = scans[5].dataset.poses(scans[5:7])
     assert part is not None
     np.testing.assert_allclose(part[:, :3].reshape(-1, 12), kitti[5:7], atol=1e-12)
 

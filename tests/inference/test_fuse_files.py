@@ -14,7 +14,7 @@ import pytest
 
 import amvnet
 from amvnet import fuse
-from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.scores import ScoreFolder, ScorePair
 from amvnet.weights.file import load, save
@@ -365,7 +365,7 @@ def test_the_run_resumes_with_its_own_scores_only(world: Path, head: Path) -> No
 def test_a_digest_of_scores_sees_any_changed_point_of_an_archive_and_the_last_of_an_array(
     ending: str, tmp_path: Path
 ) -> None:
-    record = ScanRecord("a", "00", tmp_path / "a.bin", None, prediction="a.label")
+    record = ScanFile("a", Recording("00"), tmp_path / "a.bin", prediction="a.label")
     scores = np.full((2000, 19), 1 / 19, np.float32)
 
     def digest() -> str:

@@ -56,8 +56,8 @@ def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]
     inputs, _ = list_inputs(
         [str(folder)], normaliser=Normaliser(weights_for().expects, report=lines.append)
     )
-    scans = {scan.name: scan.load().scan for scan in inputs}
-    return scans, {scan.name: scan.source for scan in inputs}, lines
+    scans = {scan.name: scan.load() for scan in inputs}
+    return scans, {scan.name: scan.recording.name for scan in inputs}, lines
 
 
 # ---- two sensors in one folder
@@ -355,6 +355,6 @@ def test_a_scan_that_is_read_again_is_the_file_as_it_is_then(tmp_path: Path) -> 
     """A scan that was kept since its sensor was measured is kept no longer than that."""
     path = write(tmp_path, "a", "os1-64", 1.7)
     (scan,), _ = list_inputs([str(path)], normaliser=Normaliser(weights_for().expects))
-    assert len(scan.load().scan) > 100
+    assert len(scan.load()) > 100
     np.save(path, np.load(path)[:100])
-    assert len(scan.load().scan) == 100
+    assert len(scan.load()) == 100

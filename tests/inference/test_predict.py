@@ -20,12 +20,13 @@ import torch
 
 import amvnet
 from amvnet.cli.options import load_segmenter
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_journals
-from amvnet.inference.listing import InputScan, list_inputs
+from amvnet.inference.listing import list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.scan_stream import READ_AHEAD
@@ -126,7 +127,7 @@ def no_segmentation(scan: Scan) -> Segmentation:
 
 
 def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> None:
-    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+    def segment(inputs: Sequence[ScanFile], scans: Sequence[Scan]) -> list[Segmentation]:
         for scan_input in inputs:
             if scan_input.name == "3":
                 raise InputError("3: broken")
@@ -149,7 +150,7 @@ OUT_OF_MEMORY = (
 
 @pytest.mark.parametrize("error", OUT_OF_MEMORY)
 def test_a_scan_that_takes_all_memory_is_a_broken_one(tmp_path: Path, error: Exception) -> None:
-    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+    def segment(inputs: Sequence[ScanFile], scans: Sequence[Scan]) -> list[Segmentation]:
         if any(scan_input.name == "3" for scan_input in inputs):
             raise error
         return list(map(no_segmentation, scans))
@@ -487,7 +488,7 @@ def test_the_journal_is_at_most_as_late_as_the_writing(tmp_path: Path) -> None:
     counter = Counter()
     scans = counted_scans(8, counter)
 
-    def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
+    def segment(inputs: Sequence[ScanFile], loaded: Sequence[Scan]) -> list[Segmentation]:
         if lines:
             counter.wait_for(scans[len(lines) - 1].name)
         lines.append(len((tmp_path / UNFINISHED).read_text().splitlines()) - 1)
@@ -671,10 +672,9 @@ def test_a_scan_that_vanishes_after_it_was_read_has_its_labels(world: Path, tmp_
     make_streets(tmp_path / "data", ("08",), scans=1)
     (scan,), _ = list_inputs([str(tmp_path / "data")])
     loaded = scan.load()
-    ids = np.ones(len(loaded.scan), np.uint8)
+    ids = np.ones(len(loaded), np.uint8)
     scan.path.unlink()
-    result = Segmentation(ids, ids == 0, np.zeros((len(ids), 19), np.float32))
-    path = scan.write_labels(tmp_path / "out", loaded, result, "label")
+    path = scan.dataset.write_labels(scan, tmp_path / "out", loaded, ids)
     assert np.fromfile(path, np.uint32).shape == ids.shape
 
 

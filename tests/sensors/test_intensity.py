@@ -17,6 +17,7 @@ from amvnet.config.schema import RangeViewConfig, Recipe
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.formats.cloud import WILD_SHARE, Cloud
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import (
@@ -29,7 +30,7 @@ from amvnet.sensors.intensity import (
     matching,
 )
 from amvnet.sensors.lidars import Sensor, rotation_from_degrees
-from amvnet.sensors.measure import MEASURED_SCANS, Recording
+from amvnet.sensors.measure import MEASURED_SCANS, Measured
 from amvnet.sensors.normalise import Normaliser
 from amvnet.training.expectation import expectation_of
 from amvnet.weights.file import Weights
@@ -178,11 +179,13 @@ def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
 
     lines: list[str] = []
     normaliser = Normaliser(weights_with().expects, report=lines.append)
+    recording = Recording("a")
     for cloud in clouds:
-        normaliser.expect("a", partial(replace, cloud))
+        read = partial(replace, cloud)
+        recording.scans.append(ScanFile(cloud.name, recording, Path(cloud.name), read=read))
     for cloud in clouds:
         alone, _ = normalise([cloud])
-        scan = normaliser(cloud, "a")
+        scan = normaliser(cloud, recording)
         np.testing.assert_array_equal(scan.points, alone[0].points)
         np.testing.assert_array_equal(scan.row, alone[0].row)
         assert ground_height(scan.points) == pytest.approx(1.73, abs=0.05)
@@ -324,7 +327,7 @@ def test_a_few_wild_intensities_do_not_decide_the_range() -> None:
 
 
 def test_scans_that_sway_have_the_intensities_of_their_recording() -> None:
-    recording = Recording(Sensor(), None)
+    recording = Measured(Sensor(), None)
     points, _ = place(LASERS["os1-64"], 1.73)
     for number in range(MEASURED_SCANS + 2):
         pitch = 8 if number % 2 else -8

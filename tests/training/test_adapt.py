@@ -14,13 +14,22 @@ import pytest
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.drives.consensus import Consensus, DriveScan
-from amvnet.inference.drive import TURN
+from amvnet.inference.drive import TURN, find_poses
+from amvnet.inference.listing import list_inputs
 from amvnet.training import adapt as adapting
-from amvnet.training.adapt import FIGURES, LEAST_PROBABILITY, LEAST_SIGHTS, Figures, recipe_for
+from amvnet.training.adapt import (
+    FIGURES,
+    LEAST_PROBABILITY,
+    LEAST_SIGHTS,
+    Figures,
+    TaughtScans,
+    recipe_for,
+    teach,
+)
 from amvnet.weights.file import load, save
 
 from fixtures.commands import refused, run_cli, succeed
-from fixtures.drives import drive_poses, write_drive
+from fixtures.drives import drive_poses, drive_scans, write_drive
 from fixtures.tiny import fresh_weights
 
 SCANS = 4
@@ -95,6 +104,54 @@ def test_points_teach_that_are_sure_and_seen_by_several_scans(world: Path) -> No
         both += int(np.count_nonzero(is_same & (result.labels > 0)))
     assert figures["agreement"] == pytest.approx(both / valid)
     assert LEAST_PROBABILITY == 0.6
+
+
+def test_drives_whose_names_are_alike_teach_by_labels_of_their_own(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(adapting, "LEAST_PROBABILITY", 0.07)
+    for index, folder in enumerate(("x/y", "x_y")):
+        Path(folder).mkdir(parents=True)
+        for number, (points, _) in enumerate(drive_scans(2, seed=index)):
+            points.tofile(f"{folder}/{number}.bin")
+    for index, root in enumerate(("A", "B")):
+        write_drive(Path(root), scans=2, seed=index)
+    segmenter = amvnet.load(world / "w.safetensors")
+    for inputs in (["x/y", "x_y"], ["A", "B"]):
+        scans, _ = list_inputs(inputs, taxonomy=segmenter.taxonomy)
+        labels_of = Path(f"{inputs[0]}.labels")
+        teach(scans, None, segmenter, labels_of)
+        taught = TaughtScans(scans, labels_of, segmenter.weights)
+        assert len(taught.parts()["train"]) == 2
+        for name, drive in zip(taught.parts()["train"], (scans[:2], scans[2:]), strict=True):
+            for record, scan in zip(taught.records([name]), drive, strict=True):
+                labels = segmenter(scan.load()).labels
+                read = taught.read(record)
+                np.testing.assert_array_equal(read.points, scan.load().points)
+                assert read.labels is not None
+                is_taught = read.labels > 0
+                assert is_taught.any()
+                np.testing.assert_array_equal(read.labels[is_taught], labels[is_taught])
+
+
+def test_two_datasets_with_a_sequence_of_one_name_are_two_drives(tmp_path: Path) -> None:
+    for index, root in enumerate(("A", "B")):
+        write_drive(tmp_path / root, scans=3, seed=index)
+    poses = tmp_path / "B/sequences/00/poses.txt"
+    np.savetxt(poses, np.loadtxt(poses) + np.eye(12)[3])  # it began a metre farther right
+    lines: list[str] = []
+    scans, _ = list_inputs([f"{tmp_path}/A", f"{tmp_path}/B"])
+    drives = find_poses(scans, report=lines.append)
+    assert [line.partition(",")[0] for line in lines] == [
+        "00: a drive of 3 scans",
+        "00 (2): a drive of 3 scans",
+    ]
+    for number, root in enumerate(("A", "B")):
+        dataset = open_dataset(f"{tmp_path}/{root}")
+        expected = dataset.poses(dataset.records(["00"]))
+        found = [drives.poses[scan] for scan in scans[3 * number : 3 * number + 3]]
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.full

@@ -14,12 +14,12 @@ import yaml
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import AugmentConfig, Recipe
 from amvnet.data.datasets import simulated
-from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.select import to_mix_in, to_train
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.training_data import Source, TrainingData
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
@@ -158,7 +158,7 @@ def test_scans_that_are_mixed_into_others_are_of_the_same_epoch(
     epochs = []
     at_epoch = SemanticKitti.at_epoch
 
-    def record_epoch(self: SemanticKitti, record: ScanRecord, epoch: int) -> ScanRecord:
+    def record_epoch(self: SemanticKitti, record: ScanFile, epoch: int) -> ScanFile:
         epochs.append(epoch)
         return at_epoch(self, record, epoch)
 
@@ -384,7 +384,7 @@ def test_scans_of_the_test_split_are_not_mixed_in_either(tmp_path: Path) -> None
 def test_scans_of_a_bag_are_told_apart_by_their_names_in_it(tmp_path: Path) -> None:
     data = open_dataset(str(make_streets(tmp_path / "a", ("00", "01"), 1)))
     val, train = (
-        [replace(record, points_path=tmp_path / "d.mcap", name=f"d/{folder}/000000")]
+        [replace(record, path=tmp_path / "d.mcap", name=f"d/{folder}/000000")]
         for folder, record in zip("ab", data.records(["00", "01"]), strict=True)
     )
     source = Source(data, data.records(["00"]), val)

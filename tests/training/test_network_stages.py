@@ -15,8 +15,8 @@ from torch.nn import functional as F
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import ModelConfig, NetworkName, NetworkTraining, Recipe, TrainingConfig
-from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.training_data import Source, TrainingData
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.layers import RingConv2d
@@ -237,7 +237,7 @@ def test_validation_scans_are_read_like_training_scans_and_not_augmented() -> No
     records = []
     for name in ("a", "b"):
         path = Path(f"{name}.bin")
-        records.append(ScanRecord(name, "00", path, None, prediction=f"{name}.label"))
+        records.append(ScanFile(name, Recording("00"), path, prediction=f"{name}.label"))
     expects = Expectation(view)
     data = TrainingData([Source(dataset, records[:1], records[1:])])
     train, val = make_loaders(Plan(recipe, data, Path("run")), CONFIG, expects)

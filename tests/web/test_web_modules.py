@@ -26,6 +26,7 @@ from amvnet.data.formats import cloud, fields, numpy_files, pcd, raw, rows
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.errors import InputError
 from amvnet.inference import segmentation
 from amvnet.models import assertion
@@ -121,8 +122,9 @@ def normalised(case: Case) -> tuple[Scan, str]:
     lines: list[str] = []
     normaliser = Normaliser(case.expected, report=lines.append)
     cloud = read_file(case.file, ending_of(case.file), UNKNOWN)
-    normaliser.expect("scans", lambda: cloud)
-    scan = normaliser(cloud, "scans")
+    recording = Recording("scans")
+    recording.scans.append(ScanFile("scan", recording, case.file, read=lambda: cloud))
+    scan = normaliser(cloud, recording)
     (line,) = lines
     return scan, line.removeprefix(f"{case.file}: ")
 

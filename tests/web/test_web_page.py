@@ -24,6 +24,7 @@ import pytest
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.engines.export.onnx import export
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.sensors.normalise import Normaliser
@@ -236,8 +237,9 @@ def reference(path: Path, weights: str | Path, graphs: Path) -> tuple[np.ndarray
     loaded = load(weights)
     normaliser = Normaliser(loaded.expects)
     cloud = read_file(path, ending_of(path), UNKNOWN)
-    normaliser.expect("scans", lambda: cloud)
-    scan = normaliser(cloud, "scans")
+    recording = Recording("scans")
+    recording.scans.append(ScanFile("scan", recording, path, read=lambda: cloud))
+    scan = normaliser(cloud, recording)
 
     result = OnnxSegmenter(graphs)(scan)
     verdict = Verdict(result.uncertain[scan.valid].mean(), loaded.usual_uncertain)

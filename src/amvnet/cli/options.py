@@ -19,8 +19,9 @@ from amvnet.sensors.lidars import AUTO, Sensor
 
 if TYPE_CHECKING:
     from amvnet.data.class_maps import ClassMap
-    from amvnet.data.datasets.base import Dataset, ScanRecord
+    from amvnet.data.datasets.base import Dataset
     from amvnet.data.datasets.training_data import Source
+    from amvnet.data.recordings import ScanFile
     from amvnet.inference.drive import DriveOptions
     from amvnet.inference.listing import Inputs, ScanOptions
     from amvnet.inference.request import LabellingRequest
@@ -76,7 +77,7 @@ class LabelledChoice:
     sequences: tuple[str, ...] | None = None
     """sequences or scenes instead of a split, separated by commas."""
 
-    def records(self, dataset: Dataset, default: SplitName = "val") -> Sequence[ScanRecord]:
+    def records(self, dataset: Dataset, default: SplitName = "val") -> Sequence[ScanFile]:
         """Return the scans, and report which scans they are.
 
         Raises:
@@ -120,7 +121,7 @@ class TrainingChoice:
         report_unused(source)
         return source
 
-    def splits(self, dataset: Dataset) -> dict[str, list[ScanRecord]]:
+    def splits(self, dataset: Dataset) -> dict[str, list[ScanFile]]:
         """Return the scans of each split by its name, including scans without labels.
 
         Scans that the split does not name are reported.
@@ -411,7 +412,7 @@ def join_processes(cuda: bool = False) -> Processes:
     return processes
 
 
-def describe_records(records: Sequence[ScanRecord]) -> str:
+def describe_records(records: Sequence[ScanFile]) -> str:
     """Return in words the number of some scans, and the names of their sequences."""
     if not records:
         return "none"

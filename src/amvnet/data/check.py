@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.plausible import (
     GROUND,
     MIN_FOLLOWING,
@@ -22,6 +22,7 @@ from amvnet.data.plausible import (
     raised_classes,
     scattered_classes,
 )
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError, listed
 from amvnet.progress import Progress, counted, no_progress
@@ -91,7 +92,7 @@ class SplitReport:
         counts = np.zeros((5, size + 1), dtype=np.int64)
         return cls(counts[0], counts[1], counts[2:4], counts[4])
 
-    def add(self, record: ScanRecord, contents: Contents) -> None:
+    def add(self, record: ScanFile, contents: Contents) -> None:
         """Add the contents of a scan."""
         self.scans.append(record.name)
         self.names[contents.digest] = record.name
@@ -103,7 +104,7 @@ class SplitReport:
             self.stray.append(record.name)
 
         for raw_id, count in contents.unknown.items():
-            example = os.path.normpath(record.labels_path or record.points_path)
+            example = os.path.normpath(record.labels_path or record.path)
             entry = self.unknown.setdefault(raw_id, UnknownId(example=example))
             entry.points += count
             entry.scans += 1
@@ -122,7 +123,7 @@ class Report:
     splits: Mapping[str, SplitReport]
     contents: Mapping[str, Contents]
 
-    def count_points(self, records: Sequence[ScanRecord]) -> np.ndarray:
+    def count_points(self, records: Sequence[ScanFile]) -> np.ndarray:
         """Return the number of points of some of the scans by train id, (K + 1,) int64."""
         counts = np.zeros(self.taxonomy.size + 1, dtype=np.int64)
         for record in records:
@@ -253,7 +254,7 @@ class Report:
 
 def check_scans(
     dataset: Dataset,
-    splits: Mapping[str, Sequence[ScanRecord]],
+    splits: Mapping[str, Sequence[ScanFile]],
     progress: Progress = no_progress,
     processes: Processes = ALONE,
 ) -> Report:
@@ -304,18 +305,18 @@ def _advice(taxonomy: Taxonomy) -> str:
 
 
 def _read_all(
-    dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
+    dataset: Dataset, records: Sequence[ScanFile], progress: Progress
 ) -> dict[str, Contents | str]:
     """Return the contents of scans, or the message about a broken scan, by the name of the scan."""
     is_ground = np.array([name == GROUND for name in coarse_names(dataset.taxonomy)])
 
-    def read(record: ScanRecord) -> Contents | str:
+    def read(record: ScanFile) -> Contents | str:
         try:
             return _contents_of(dataset, record, is_ground)
         except InputError as error:
             return str(error)
         except OSError as error:  # for example, a network disk has failed
-            return f"{error.filename or record.points_path}: {error.strerror or error}"
+            return f"{error.filename or record.path}: {error.strerror or error}"
 
     found = {}
     with ThreadPoolExecutor(min(dataset.readers, os.cpu_count() or 1)) as pool:
@@ -327,7 +328,7 @@ def _read_all(
     return found
 
 
-def _contents_of(dataset: Dataset, record: ScanRecord, is_ground: np.ndarray) -> Contents:
+def _contents_of(dataset: Dataset, record: ScanFile, is_ground: np.ndarray) -> Contents:
     """Read a scan and its labels, given which (K + 1,) train ids are of the ground."""
     scan = dataset.read_unchanged(record)
     raw = dataset.raw_labels(record, len(scan)).astype(np.int64) & INSTANCE_MASK

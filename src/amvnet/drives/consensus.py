@@ -22,6 +22,8 @@ STEPS = 16
 _BITS = 21  # bits of a voxel's place along one axis
 LARGEST_INDEX = 1 << (_BITS - 1)  # voxels in so many places on each side have keys of their own
 
+NOTHING = (np.empty((0, 0), np.float32), np.empty(0, np.int32))  # the consensus on no points
+
 Item = TypeVar("Item")
 
 
@@ -129,7 +131,7 @@ class Fused(NamedTuple, Generic[Item]):
 
 
 @dataclass(frozen=True)
-class _Seen(Generic[Item]):
+class _Seen:
     """A scan in reach.
 
     Attributes:
@@ -141,7 +143,6 @@ class _Seen(Generic[Item]):
             of each small one.
     """
 
-    item: Item
     logs: NDArray[np.float32]
     is_fused: NDArray[np.bool_]
     keys: tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -180,28 +181,32 @@ class Consensus:
         count.
         """
         self._tables = []
-        window = deque[_Seen[Item]]()  # the scans in reach of the next one to return
+        # The scans in reach of the next one to return; None stands for what has no points.
+        window = deque[tuple[Item, _Seen | None]]()
         place = 0  # the index of the next one in the window
         for count, scan in enumerate(chain(scans, repeat(None, self.ahead))):
             if scan is not None:
-                seen = self._see(scan)
-                window.append(seen)
-                if not self._tables:
-                    self._tables = [VoxelTable(sums.shape[1]) for sums in seen.sums]
-                for table, keys, sums in zip(self._tables, seen.keys, seen.sums, strict=True):
-                    table.add(keys, sums)
+                seen = self._see(scan) if len(scan.xyz) else None
+                window.append((scan.item, seen))
+                if seen is not None:
+                    if not self._tables:
+                        self._tables = [VoxelTable(sums.shape[1]) for sums in seen.sums]
+                    for table, keys, sums in zip(self._tables, seen.keys, seen.sums, strict=True):
+                        table.add(keys, sums)
             if count < self.ahead:
                 continue
 
-            yield Fused(window[place].item, *self._fuse(window[place]))
+            item, seen = window[place]
+            yield Fused(item, *(NOTHING if seen is None else self._fuse(seen)))
             if place < self.reach:
                 place += 1
                 continue
-            seen = window.popleft()
-            for table, keys, sums in zip(self._tables, seen.keys, seen.sums, strict=True):
-                table.remove(keys, sums)
+            _, seen = window.popleft()
+            if seen is not None:
+                for table, keys, sums in zip(self._tables, seen.keys, seen.sums, strict=True):
+                    table.remove(keys, sums)
 
-    def _see(self, scan: DriveScan[Item]) -> _Seen[Item]:
+    def _see(self, scan: DriveScan[Item]) -> _Seen:
         """Sum the log scores of a scan by voxel."""
         is_fused, logs, weighted = weighted_logs(scan.scores)
         xyz = np.asarray(scan.xyz, np.float64)
@@ -212,7 +217,6 @@ class Consensus:
         large, parent = np.unique(keys_of(index[first] // 2), return_inverse=True)
         sums = sum_by(inverse, weighted, len(small))
         return _Seen(
-            scan.item,
             logs,
             is_fused,
             keys=(small, large),
@@ -220,7 +224,7 @@ class Consensus:
             inverse=(inverse, parent),
         )
 
-    def _fuse(self, seen: _Seen[Item]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    def _fuse(self, seen: _Seen) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Return the fused probabilities and the sights of a scan whose reach is in the tables."""
         sights = np.zeros(len(seen.logs), np.int32)
         sights[seen.is_fused] = self._tables[0].scans(seen.keys[0])[seen.inverse[0]]

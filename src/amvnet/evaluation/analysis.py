@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation, metrics
@@ -78,7 +79,7 @@ def swept_row(value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxo
 
 def analyze(
     dataset: Dataset,
-    records: Sequence[ScanRecord],
+    records: Sequence[ScanFile],
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> Analysis:
@@ -105,7 +106,7 @@ def analyze(
         head=np.zeros((SWEPT_BINS, size, size), dtype=np.int64),
     )
 
-    def analyze_one(record: ScanRecord, scan: Scan) -> Analysis:
+    def analyze_one(record: ScanFile, scan: Scan) -> Analysis:
         return _analyze_scan(check_scan(scan), segmenter, assertion)
 
     for analysis in stream_labelled(dataset, records, analyze_one, segmenter.at_once, progress):

@@ -17,7 +17,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -87,7 +88,7 @@ class PointDoubts:
 
 def rank(
     dataset: Dataset,
-    records: Sequence[ScanRecord],
+    records: Sequence[ScanFile],
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> np.ndarray:
@@ -101,7 +102,7 @@ def rank(
     if not {"range_net", "polar_net"} <= set(segmenter.weights.parts):
         raise InputError("expected weights with both networks, found only one; train the other")
 
-    def rank_scan(record: ScanRecord, scan: Scan) -> np.ndarray:
+    def rank_scan(record: ScanFile, scan: Scan) -> np.ndarray:
         return find_clusters(measure_doubts(check_scan(scan), segmenter))
 
     rows_by_scan = [np.zeros(0, dtype=ROW)]  # in case there are no scans
@@ -219,7 +220,7 @@ def _most_common(ids: NDArray[np.integer], group: NDArray[np.intp], count: int) 
 
 
 def write_clusters(
-    clusters: np.ndarray, records: Sequence[ScanRecord], taxonomy: Taxonomy, path: Path
+    clusters: np.ndarray, records: Sequence[ScanFile], taxonomy: Taxonomy, path: Path
 ) -> None:
     """Write clusters, sorted rows of `ROW`, to a CSV file with their ranks in the first column."""
     names = ("", *taxonomy.classes)

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
+from amvnet.data.recordings import ScanFile
 from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.drives.consensus import DriveScan
@@ -52,7 +53,7 @@ class MethodLabels(NamedTuple):
     turned: np.ndarray | None = None
 
 
-Labelled = tuple[ScanRecord, Scan, MethodLabels]  # a scan with its labels by several methods
+Labelled = tuple[ScanFile, Scan, MethodLabels]  # a scan with its labels by several methods
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Labeller:
         segmenter: what computes the labels, or None if they come from files.
     """
 
-    label: Callable[[ScanRecord, Scan], MethodLabels]
+    label: Callable[[ScanFile, Scan], MethodLabels]
     taxonomy: Taxonomy
     classes: ClassMap | None = None
     at_once: int = 1
@@ -81,7 +82,7 @@ class Labeller:
 
 def evaluate(
     dataset: Dataset,
-    records: Sequence[ScanRecord],
+    records: Sequence[ScanFile],
     labeller: Labeller,
     pictures: Path | None = None,
     progress: Progress = no_progress,
@@ -107,11 +108,11 @@ def evaluate(
     evaluation = Evaluation(taxonomy)
     pictured = {record.name for record in evenly_spaced(records, MAX_PICTURES)}
 
-    def label(record: ScanRecord, scan: Scan) -> tuple[ScanRecord, Scan, MethodLabels]:
+    def label(record: ScanFile, scan: Scan) -> tuple[ScanFile, Scan, MethodLabels]:
         labels = labeller.label(record, scan)
         if drives is not None:
             assert labeller.segmenter is not None
-            yaw = drives.yaws[record.sequence, record.name]
+            yaw = drives.yaws[record]
             labels = labels._replace(turned=labeller.segmenter(scan, yaw=yaw).scores)
         return record, scan, labels
 
@@ -139,7 +140,7 @@ def evaluate(
 
 def _with_consensus(labelled: Iterator[Labelled], drives: Drives) -> Iterator[Labelled]:
     """Add the labels by `DRIVE` to the labels of scans, which are in the order of their drives."""
-    for _, drive in groupby(labelled, key=lambda item: item[0].sequence):
+    for _, drive in groupby(labelled, key=lambda item: item[0].recording):
         for (record, scan, labels), scores, _ in drives.consensus().stream(
             _drive_scan(item, drives) for item in drive
         ):
@@ -150,30 +151,30 @@ def _with_consensus(labelled: Iterator[Labelled], drives: Drives) -> Iterator[La
 def _drive_scan(item: Labelled, drives: Drives) -> DriveScan[Labelled]:
     record, scan, labels = item
     assert labels.turned is not None
-    pose = drives.poses[record.sequence, record.name]
+    pose = drives.poses[record]
     return DriveScan(item, scan.points[:, :3], labels.turned, pose)
 
 
-def pictures_of(records: Sequence[ScanRecord], folder: Path) -> dict[Path, Signature]:
+def pictures_of(records: Sequence[ScanFile], folder: Path) -> dict[Path, Signature]:
     """Return the pictures that `evaluate` draws of some scans into a folder, by their paths."""
     pictured = evenly_spaced(records, MAX_PICTURES)
     return {_picture_of(record, folder): PICTURE for record in pictured}
 
 
-def _picture_of(record: ScanRecord, folder: Path) -> Path:
+def _picture_of(record: ScanFile, folder: Path) -> Path:
     return inside(folder, f"{record.name.replace('/', '_')}.png")
 
 
 def stream_labelled(
     dataset: Dataset,
-    records: Sequence[ScanRecord],
-    compute: Callable[[ScanRecord, Scan], Result],
+    records: Sequence[ScanFile],
+    compute: Callable[[ScanFile, Scan], Result],
     at_once: int,
     progress: Progress,
 ) -> Iterator[Result]:
     """Yield results as `stream_scans` does; raise InputError if a scan has no true labels."""
 
-    def read(record: ScanRecord) -> Scan:
+    def read(record: ScanFile) -> Scan:
         scan = dataset.read(record)
         if scan.labels is None:
             raise InputError(
@@ -192,7 +193,7 @@ def label_by_weights(
 ) -> Labeller:
     """Return a labeller that labels scans with some weights, by several methods."""
 
-    def label(record: ScanRecord, scan: Scan) -> MethodLabels:
+    def label(record: ScanFile, scan: Scan) -> MethodLabels:
         return labels_by_method(segmenter, check_scan(scan), methods)
 
     return Labeller(label, segmenter.taxonomy, classes, segmenter.at_once, segmenter)
@@ -229,7 +230,7 @@ def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = 
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 
-    def label(record: ScanRecord, scan: Scan) -> MethodLabels:
+    def label(record: ScanFile, scan: Scan) -> MethodLabels:
         return MethodLabels({"predictions": dataset.read_prediction(record, folder)})
 
     return Labeller(label, dataset.taxonomy, classes)

@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.labels.ids import check_size, train_ids
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, listed
 from amvnet.files import atomic_write
@@ -164,7 +165,7 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
 RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuScenes: _nuscenes}
 
 
-def _count_points(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, int]:
+def _count_points(dataset: Dataset, records: Sequence[ScanFile]) -> dict[str, int]:
     return {record.prediction: dataset.count_points(record) for record in records}
 
 

@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from amvnet.data.datasets.files import ScanFiles
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import BAGS, FOLDER, ending_of
-from amvnet.data.formats.find import NamedScan
 from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import RowLayout
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -32,7 +33,8 @@ from amvnet.fleet.manifest import check_outside, split_name
 from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, results_schema
 from amvnet.fleet.secrets import without_secrets
 from amvnet.fleet.storage import Place
-from amvnet.inference.listing import FileReader, Inputs, Outcome
+from amvnet.inference.drive import Broken, Outcome
+from amvnet.inference.listing import Inputs
 from amvnet.inference.loading import load_with
 from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
@@ -114,14 +116,11 @@ class LabelScans:
             check_outside(Place.of(row["path"]), self._out)
 
         request = self.request
-        reader = _make_reader(request)
-        if drive[0]["estimates"]:
-            assert reader.normaliser is not None
-            usual = parse_estimate(drive[0]["estimates"])
-            reader.normaliser.recall({drive[0]["drive"]: usual})
-
-        with _fetch(drive, request.layout) as (named_scans, folder):
-            scans = reader.scans(named_scans, request.taxonomy)
+        with _fetch(drive, request) as (dataset, normaliser, folder):
+            (recording,) = dataset.recordings()
+            if drive[0]["estimates"]:
+                normaliser.recall({recording: parse_estimate(drive[0]["estimates"])})
+            scans = dataset.records()
             pipeline = Pipeline(
                 scans,
                 segment_by(self._segmenter, request.classes),
@@ -137,14 +136,15 @@ class LabelScans:
 
     def _write(self, pipeline: Pipeline, row_of: Mapping[str, Row], outcome: Outcome) -> Row:
         """Write the files of a scan, the labels last, and return its row of results."""
-        scan, loaded, result = outcome
+        scan = outcome.scan
         row = row_of[scan.name]
-        if loaded is None or isinstance(result, InputError):
-            return self._row(row, error=str(result).replace(str(scan.path), _shown_path(row)))
+        if isinstance(outcome, Broken):
+            line = str(outcome.error).replace(str(scan.path), _shown_path(row))
+            return self._row(row, error=line)
 
         paths = list(pipeline.output.files_of(scan))
         try:
-            entry = pipeline.write(scan, loaded, result)
+            entry = pipeline.write(outcome)
             if self._out.local is None:
                 for path in reversed(paths):
                     place = self._out / path.as_posix()
@@ -156,7 +156,7 @@ class LabelScans:
             return self._row(row, error=f"{place_name}: {error.strerror or error}", is_fatal=True)
 
         labels = (self._out / paths[0].as_posix()).url
-        counts = statistics(result, self.request.taxonomy)
+        counts = statistics(outcome.result, self.request.taxonomy)
         return self._row(row, labels=labels, points=entry.points, **counts)
 
     def _row(self, row: Row, **values: Any) -> Row:
@@ -188,45 +188,49 @@ class MeasureSensors:
 
 def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     """Measure the sensor of a drive on its first scans; return its row in the table of drives."""
-    source = drive[0]["drive"]
     assumed = ""
-    reader = _make_reader(request)
     usual = None
     # A scan that cannot be read is reported as broken when it is labelled.
-    with suppress(Exception), _fetch(drive, request.layout) as (named_scans, _):
-        scans = reader.scans(named_scans, request.taxonomy)
-        assert reader.normaliser is not None
-        usual = reader.normaliser.measure(source).usual
-        for scan, row in zip(scans, drive, strict=True):
+    with suppress(Exception), _fetch(drive, request) as (dataset, normaliser, _):
+        (recording,) = dataset.recordings()
+        usual = normaliser.measure(recording).usual
+        for scan, row in zip(dataset.records(), drive, strict=True):
             with suppress(InputError):  # the first scan that can be read gives the line
-                line = scan.load().scan.assumed
-                assumed = line.replace(str(scan.path), _shown_path(row))
+                assumed = scan.load().assumed.replace(str(scan.path), _shown_path(row))
                 break
-    return describe_drive(source, assumed, usual)
+    return describe_drive(drive[0]["drive"], assumed, usual)
 
 
 def choose_weights(drive: Sequence[Row], sensor: Sensor, layout: RowLayout) -> tuple[str, str]:
     """Return the name of built-in weights for a drive, and why, as `Inputs.choose_weights`."""
-    with _fetch(drive, layout) as (named_scans, _):
-        return Inputs([named_scans]).choose_weights(sensor)
-
-
-def _make_reader(request: LabellingRequest) -> FileReader:
-    return FileReader(Normaliser(request.weights.expects, request.sensor))
+    with _fetched(drive, layout) as (scans, _):
+        return Inputs([ScanFiles(scans)]).choose_weights(sensor)
 
 
 @contextmanager
-def _fetch(drive: Sequence[Row], layout: RowLayout) -> Iterator[tuple[list[NamedScan], Path]]:
+def _fetch(
+    drive: Sequence[Row], request: LabellingRequest
+) -> Iterator[tuple[ScanFiles, Normaliser, Path]]:
+    """Yield the scans of a drive, what normalises them, and a temporary folder for labels."""
+    normaliser = Normaliser(request.weights.expects, request.sensor)
+    with _fetched(drive, request.layout) as (scans, folder):
+        yield ScanFiles(scans, request.weights.taxonomy, normaliser), normaliser, folder
+
+
+@contextmanager
+def _fetched(drive: Sequence[Row], layout: RowLayout) -> Iterator[tuple[list[ScanFile], Path]]:
     """Yield the scans of a drive and a temporary folder for labels; fetch the files ahead."""
+    recording = Recording(drive[0]["drive"])
     with temporary_folder() as temporary, ThreadPoolExecutor(TRANSFERS) as pool:
-        scans = []
         for index, row in enumerate(drive):
             folder = temporary / str(index)
             place = Place.of(row["path"])
             path = place.local or folder / Path(place.path).name
             read = partial(_read_fetched, pool.submit(place.fetch, folder), layout)
-            scans.append(NamedScan(row["name"], row["drive"], path, ending="", read=read))
-        yield scans, temporary / "labels"
+            name = row["name"]
+            scan = ScanFile(name, recording, path, prediction=f"{name}.label", read=read)
+            recording.scans.append(scan)
+        yield recording.scans, temporary / "labels"
 
 
 def _read_fetched(fetching: Future[Path], layout: RowLayout) -> Cloud:

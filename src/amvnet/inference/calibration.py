@@ -28,7 +28,7 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
     inputs, _ = list_inputs([text], taxonomy=weights.taxonomy, normaliser=normaliser)
     scans = []
     for scan_input in evenly_spaced(inputs, MAX_SCANS):
-        scan = scan_input.load().scan
+        scan = scan_input.load()
         if scan.valid.any():
             scans.append(weights.expects.prepare(scan))
 

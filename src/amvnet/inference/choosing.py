@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from amvnet.data.datasets.files import ScanFiles
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.find import NamedScan
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.errors import InputError
-from amvnet.inference.listing import Inputs, InputScan
+from amvnet.inference.listing import Inputs
 from amvnet.inference.reading import array_cloud
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Reporter
@@ -23,8 +24,9 @@ CHOSEN = ("weights", "engine", "at_once")  # what a segmenter lacks until its we
 
 def choose_by(cloud: Cloud, sensor: Sensor) -> tuple[str, str]:
     """Return the name of built-in weights for a scan in memory, and why, as `Inputs` does."""
-    scan = NamedScan("scan", source="scan", path=Path("scan"), ending="", read=lambda: cloud)
-    return Inputs([[scan]]).choose_weights(sensor)
+    recording = Recording("scan")
+    recording.scans.append(ScanFile("scan", recording, Path("scan"), read=lambda: cloud))
+    return Inputs([ScanFiles(recording.scans)]).choose_weights(sensor)
 
 
 class ChoosingSegmenter(Segmenter):
@@ -54,7 +56,7 @@ class ChoosingSegmenter(Segmenter):
             return super().__repr__()
         return "<Segmenter with built-in weights by the lasers of the first scan>"
 
-    def _list(self, inputs: Inputs) -> list[InputScan]:
+    def _list(self, inputs: Inputs) -> list[ScanFile]:
         if not self._choice:
             self._take(*inputs.choose_weights(self.sensor))
         return super()._list(inputs)

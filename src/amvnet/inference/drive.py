@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amvnet.data.poses import Poses, as_pose, check_rigid, read_poses, times_of
+from amvnet.data.recordings import Recording, ScanFile, by_recording
 from amvnet.data.spacing import evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit, check_steps
 from amvnet.errors import InputError
 from amvnet.files import digest
-from amvnet.inference.listing import InputScan, LoadedScan, Outcome
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
@@ -58,16 +58,35 @@ class DriveOptions:
 
 
 @dataclass(frozen=True)
+class Labelled:
+    """A scan that was read (`loaded`), and the result for it."""
+
+    scan: ScanFile
+    loaded: Scan
+    result: Segmentation
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A scan that could not be read or segmented, and why."""
+
+    scan: ScanFile
+    error: InputError
+
+
+Outcome = Labelled | Broken
+
+
+@dataclass(frozen=True)
 class Drives:
     """The poses of the scans of one or several drives.
 
     Attributes:
-        poses: the pose (4, 4) of each scan, by the recording and the name of the scan; it moves the
-            points of the scan's file, in metres.
+        poses: the pose (4, 4) of each scan; it moves the points of the scan's file, in metres.
         table: maps the labels to other classes; by default, they stay unchanged.
     """
 
-    poses: Mapping[tuple[str, str], Poses]
+    poses: Mapping[ScanFile, Poses]
     past_only: bool = False
     table: NDArray[np.uint8] | None = None
 
@@ -77,18 +96,18 @@ class Drives:
         values = np.array(list(self.poses.values())).tobytes()
         return f"{digest([values])}, past only: {self.past_only}"
 
-    def motion(self, scan: InputScan, loaded: LoadedScan) -> Poses:
+    def motion(self, scan: ScanFile, loaded: Scan) -> Poses:
         """Return the motion (4, 4) of a scan, normalised to the weights, into the world."""
-        return self.poses[key_of(scan)] @ to_file(loaded.scan)
+        return self.poses[scan] @ to_file(loaded)
 
     @cached_property
-    def yaws(self) -> dict[tuple[str, str], float]:
+    def yaws(self) -> dict[ScanFile, float]:
         """The angle by which the networks get each scan turned, radians."""
-        places: Counter[str] = Counter()
+        places: Counter[Recording] = Counter()
         yaws = {}
-        for source, name in self.poses:
-            yaws[source, name] = places[source] * TURN
-            places[source] += 1
+        for scan in self.poses:
+            yaws[scan] = places[scan.recording] * TURN
+            places[scan.recording] += 1
         return yaws
 
     def consensus(self) -> Consensus:
@@ -100,50 +119,42 @@ class Drives:
         consensus = self.consensus()
         return slice(max(index - consensus.reach, 0), index + consensus.ahead + 1)
 
-    def in_reach(self, scans: Sequence[InputScan], chosen: Sequence[InputScan]) -> list[InputScan]:
+    def in_reach(self, scans: Sequence[ScanFile], chosen: Iterable[ScanFile]) -> list[ScanFile]:
         """Return the chosen scans and all scans on which their labels depend, in order."""
-        keys = set(map(key_of, chosen))
-        needed: list[InputScan] = []
-        for _, drive in groupby(scans, key=lambda scan: scan.source):
-            members = list(drive)
+        chosen = set(chosen)
+        needed: list[ScanFile] = []
+        for members in by_recording(scans).values():
             is_needed = np.zeros(len(members), bool)
             for index, scan in enumerate(members):
-                if key_of(scan) in keys:
+                if scan in chosen:
                     is_needed[self.reach_of(index)] = True
             needed += [scan for scan, is_in in zip(members, is_needed, strict=True) if is_in]
         return needed
 
     def fuse(self, outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
-        """Yield outcomes, in the order of each drive, with the consensus as labels and scores."""
-        broken = deque[Outcome]()
-        for (scan, loaded, result), scores, _ in self.consensus_of(outcomes, broken):
-            while broken:
-                yield broken.popleft()
-            assert isinstance(result, Segmentation)
-            yield scan, loaded, with_scores(result, scores, self.table)
-        yield from broken
+        """Yield outcomes, drive by drive, with the consensus as labels and scores."""
+        for outcome, scores, _ in self.consensus_of(outcomes):
+            if isinstance(outcome, Labelled):
+                result = with_scores(outcome.result, scores, self.table)
+                outcome = replace(outcome, result=result)
+            yield outcome
 
-    def consensus_of(
-        self, outcomes: Iterable[Outcome], broken: deque[Outcome] | None = None
-    ) -> Iterator[Fused[Outcome]]:
-        """Yield the consensus on the scans of each drive, which are in order.
+    def consensus_of(self, outcomes: Iterable[Outcome]) -> Iterator[Fused[Outcome]]:
+        """Yield the consensus on the scans of each drive, which come in order, drive by drive.
 
-        `broken` gets the scans that are broken; they are left out.
+        A broken scan has its place in the drive, but no points.
         """
-        aside = deque[Outcome]() if broken is None else broken
-        for _, drive in groupby(outcomes, key=lambda outcome: outcome[0].source):
-            yield from self.consensus().stream(self._segmented(drive, aside))
+        for _, drive in groupby(outcomes, key=lambda outcome: outcome.scan.recording):
+            yield from self.consensus().stream(self._of_drive(drive))
 
-    def _segmented(
-        self, outcomes: Iterable[Outcome], broken: deque[Outcome]
-    ) -> Iterator[DriveScan[Outcome]]:
+    def _of_drive(self, outcomes: Iterable[Outcome]) -> Iterator[DriveScan[Outcome]]:
         for outcome in outcomes:
-            scan, loaded, result = outcome
-            if loaded is None or isinstance(result, InputError):
-                broken.append(outcome)
-                continue
-            xyz = loaded.scan.points[:, :3]
-            yield DriveScan(outcome, xyz, result.scores, self.motion(scan, loaded))
+            if isinstance(outcome, Broken):
+                yield DriveScan(outcome, np.empty((0, 3)), np.empty((0, 0)), np.eye(4))
+            else:
+                xyz = outcome.loaded.points[:, :3]
+                motion = self.motion(outcome.scan, outcome.loaded)
+                yield DriveScan(outcome, xyz, outcome.result.scores, motion)
 
 
 def drive(
@@ -202,18 +213,13 @@ def with_scores(
     return replace(result, scores=scores, labels=labels if table is None else table[labels])
 
 
-def key_of(scan: InputScan) -> tuple[str, str]:
-    """Return the recording and the name of a scan, which belong to no other scan."""
-    return scan.source, scan.name
-
-
 def to_file(scan: Scan) -> Poses:
     """Return the motion (4, 4) of a scan's points into the frame of its file."""
     return np.eye(4) if scan.to_file is None else scan.to_file
 
 
 def find_poses(
-    scans: Sequence[InputScan],
+    scans: Sequence[ScanFile],
     path: Path | None = None,
     past_only: bool = False,
     *,
@@ -237,26 +243,25 @@ def find_poses(
             for each scan, or a file is given for several drives; if the poses do not fit the scans;
             or if a scan cannot be read or kiss-icp is missing where poses are estimated.
     """
-    sources: dict[str, list[InputScan]] = {}
-    for scan in scans:
-        sources.setdefault(scan.source, []).append(scan)
+    drives = by_recording(scans)
     is_file = path is not None and path.is_file()
-    if (is_file or is_one) and len(sources) > 1:
-        more = ", ..." if len(sources) > 3 else ""
+    if (is_file or is_one) and len(drives) > 1:
+        names = [recording.name for recording in drives]
+        more = ", ..." if len(names) > 3 else ""
         raise InputError(
-            f"expected the scans of one drive, found {len(sources)} recordings "
-            f"({', '.join(list(sources)[:3])}{more}); choose one, with --sequences or as INPUT"
+            f"expected the scans of one drive, found {len(names)} recordings "
+            f"({', '.join(names[:3])}{more}); choose one, with --sequences or as INPUT"
         )
-    for source, members in sources.items():
+    for recording, members in drives.items():
         if len(members) < LEAST_SCANS:
             raise InputError(
-                f"{source}: expected the consecutive scans of a drive, found a single scan; "
-                "give all scans of the drive"
+                f"{recording.name}: expected the consecutive scans of a drive, found a single "
+                "scan; give all scans of the drive"
             )
 
-    found: dict[tuple[str, str], Poses] = {}
-    for source, members in sources.items():
-        name = str(path) if is_file else source
+    found: dict[ScanFile, Poses] = {}
+    for recording, members in drives.items():
+        name = str(path) if is_file else recording.name
         poses, where = _recorded(members, path, report)
         if poses is None:
             bag = members[0].bag
@@ -278,12 +283,12 @@ def find_poses(
                 f"warning: {name}: the poses are less exact than the scans: the scans have {fit}, "
                 "so that less is gained by fusing them; check the time and the place of the LiDAR"
             )
-        found |= {key_of(scan): pose for scan, pose in zip(members, poses, strict=True)}
+        found |= dict(zip(members, poses, strict=True))
     return Drives(found, past_only)
 
 
 def _recorded(
-    scans: Sequence[InputScan], path: Path | None, report: Reporter
+    scans: Sequence[ScanFile], path: Path | None, report: Reporter
 ) -> tuple[Poses | None, str]:
     """Return the poses (N, 4, 4) of a drive, or None if they are unknown, and what holds them."""
     if path is not None:
@@ -296,16 +301,16 @@ def _recorded(
         note = f", {track.note}" if track.note else ""
         return track.at(times, len(scans)), f"the file{note}"
 
-    return scans[0].poses(scans), DATASET
+    return scans[0].dataset.poses(scans), DATASET
 
 
-def _estimated(scans: Sequence[InputScan], count: Callable[[int], None]) -> Poses:
+def _estimated(scans: Sequence[ScanFile], count: Callable[[int], None]) -> Poses:
     odometry = Odometry()
     poses = []
     for index, scan in enumerate(scans):
         count(index)
         try:
-            loaded = scan.load().scan
+            loaded = scan.load()
             pose = odometry(loaded.points[loaded.valid, :3])
             poses.append(pose @ np.linalg.inv(to_file(loaded)))
         except InputError:  # the segmentation reports the broken scan
@@ -314,7 +319,7 @@ def _estimated(scans: Sequence[InputScan], count: Callable[[int], None]) -> Pose
     return np.array(poses)
 
 
-def _times(scans: Sequence[InputScan]) -> list[float] | None:
+def _times(scans: Sequence[ScanFile]) -> list[float] | None:
     """Return the times of scans in seconds, if their bag or their names state them."""
     bag = scans[0].bag
     if bag is not None:
@@ -322,7 +327,7 @@ def _times(scans: Sequence[InputScan]) -> list[float] | None:
     return times_of(Path(scan.name).name.removesuffix(scan.path.suffix) for scan in scans)
 
 
-def _pairs(scans: Sequence[InputScan], poses: Poses) -> Iterator[Pair]:
+def _pairs(scans: Sequence[ScanFile], poses: Poses) -> Iterator[Pair]:
     """Yield pairs of scans that show whether the poses fit; unreadable scans show nothing."""
     for first in evenly_spaced(range(len(scans) - 1), PAIRS):
         # The farther apart two scans are, the more a wrong motion shows, if they see the same
@@ -331,7 +336,7 @@ def _pairs(scans: Sequence[InputScan], poses: Poses) -> Iterator[Pair]:
         is_near = np.linalg.norm(ahead, axis=1) < FAR
         last = first + max(int(np.cumprod(is_near).sum()), 1)
         with suppress(InputError):
-            before, after = scans[first].load().scan, scans[last].load().scan
+            before, after = scans[first].load(), scans[last].load()
             into_world = poses[first] @ to_file(before)
             motion = np.linalg.inv(into_world) @ poses[last] @ to_file(after)
             yield Pair(_standing(before), _standing(after), motion)

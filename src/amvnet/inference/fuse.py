@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
+from amvnet.inference.listing import ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults, check_output
 from amvnet.inference.reading import checked_scan
 from amvnet.inference.scores import LEAST_PROBABILITY, ScorePair, as_probabilities, have_opinion
@@ -175,7 +176,7 @@ def fuse_files(
 
     silent: Counter[str] = Counter()  # by side, the points without an opinion of the model
 
-    def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
+    def segment(inputs: Sequence[ScanFile], loaded: Sequence[Scan]) -> list[Segmentation]:
         results = []
         for scan_input, scan in zip(inputs, loaded, strict=True):
             f, g = pair.read(scan_input.scores_path, scan, taxonomy.size)

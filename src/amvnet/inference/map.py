@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.poses import Poses
+from amvnet.data.recordings import ScanFile
 from amvnet.drives.world_map import MapBuilder, WorldMap
-from amvnet.inference.drive import Drives, key_of
-from amvnet.inference.listing import InputScan, LoadedScan
+from amvnet.inference.drive import Drives
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, no_progress
+from amvnet.scan import Scan
 
 SAVED_SCANS = 50  # number of scans after which the unfinished map is saved again
 
@@ -31,7 +32,7 @@ class SavedMap:
 
 
 def map_drive(
-    scans: Sequence[InputScan],
+    scans: Sequence[ScanFile],
     drives: Drives,
     segmenter: Segmenter,
     builder: MapBuilder,
@@ -44,9 +45,9 @@ def map_drive(
         InputError: if a scan cannot be read or segmented.
     """
 
-    def segment(scan: InputScan, loaded: LoadedScan) -> tuple[np.ndarray, Segmentation, Poses]:
-        result = segmenter(loaded.scan, yaw=drives.yaws[key_of(scan)])
-        return loaded.scan.points[:, :3], result, drives.motion(scan, loaded)
+    def segment(scan: ScanFile, loaded: Scan) -> tuple[np.ndarray, Segmentation, Poses]:
+        result = segmenter(loaded, yaw=drives.yaws[scan])
+        return loaded.points[:, :3], result, drives.motion(scan, loaded)
 
     done = 0
     if saved is not None and saved.resume:

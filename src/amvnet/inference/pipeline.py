@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -18,11 +18,12 @@ import numpy as np
 
 from amvnet.data.formats.registry import COLUMN_READERS
 from amvnet.data.labels.writers import SCORES, SIGNATURES, UNCERTAIN, write_uncertain
+from amvnet.data.recordings import ScanFile, by_recording
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken, memory_for
 from amvnet.files import alone_in, atomic_write, inside
-from amvnet.inference.drive import Drives
+from amvnet.inference.drive import Broken, Drives, Labelled, Outcome
 from amvnet.inference.journal import UNFINISHED, Entry, Journal, check_unchanged, read_journals
-from amvnet.inference.listing import InputScan, LoadedScan, Outcome
 from amvnet.inference.scan_stream import READ_AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
 from amvnet.outputs import Signature, check_not_read, check_outputs
@@ -41,6 +42,7 @@ class OutputOptions:
     Attributes:
         kind: the format of the labels of scan files, one of `writers.KINDS`; datasets have their
             own format.
+        taxonomy: the classes of the labels; by default the classes of the dataset.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.
         uncertain: also write which points are uncertain, (N,) bool, as `.uncertain.npy`.
@@ -51,15 +53,16 @@ class OutputOptions:
 
     folder: Path
     kind: str = "label"
+    taxonomy: Taxonomy | None = None
     scores: bool = False
     uncertain: bool = False
     overwrite: bool = False
     resume: bool = False
     also_read: Sequence[Path | str | None] = ()
 
-    def files_of(self, scan: InputScan) -> dict[Path, Signature]:
+    def files_of(self, scan: ScanFile) -> dict[Path, Signature]:
         """Return the files that are written for a scan, by the path relative to the folder."""
-        labels = scan.labels_path(self.kind)
+        labels = scan.dataset.place_of_prediction(scan, self.kind)
         ending = labels.suffix or f".{self.kind}"  # a name such as ".label" has no suffix
         files = {labels: SIGNATURES[ending]}
         if self.scores:
@@ -71,7 +74,7 @@ class OutputOptions:
 
 # A function that segments scans in memory, given the inputs that they were read from. It raises
 # InputError if a scan is broken.
-Segment = Callable[[Sequence[InputScan], Sequence[Scan]], list[Segmentation]]
+Segment = Callable[[Sequence[ScanFile], Sequence[Scan]], list[Segmentation]]
 Written = TypeVar("Written")
 
 
@@ -86,7 +89,7 @@ class Pipeline:
             the threads.
     """
 
-    scans: Sequence[InputScan]
+    scans: Sequence[ScanFile]
     segment: Segment
     output: OutputOptions
     batch: int = 1
@@ -113,49 +116,54 @@ class Pipeline:
         folder = self.output.folder
         with alone_in(folder):
             check_output(self.scans, self.output)  # another run may have ended meanwhile
-            earlier = read_journals(folder)
-            changed = earlier.changed(settings)
-            if self.output.resume:
-                advice = "start over with --overwrite instead of --resume"
-                check_unchanged(folder, changed, advice)
-            kept = {} if changed else self._kept(earlier.entries)
-            remaining = [scan for scan in self.scans if _key(scan) not in kept]
-
-            # Scans around the remaining ones are segmented again, if labels depend on them.
-            segmented = remaining
-            if self.drives is not None:
-                segmented = self.drives.in_reach(self.scans, remaining)
-            new = {_key(scan) for scan in remaining}
-
-            def write(outcome: Outcome) -> Entry | str | None:
-                return self.write_or_explain(outcome) if _key(outcome[0]) in new else None
+            kept = self._kept(settings)
+            remaining = {scan for scan in self.scans if _key(scan) not in kept}
 
             faults: list[str] = []
             with Journal(folder, settings, kept.values()) as journal:
-                for outcome in self.stream(segmented, write, progress=progress):
-                    if outcome is None:
-                        continue
-                    if isinstance(outcome, Entry):
-                        journal.add(outcome)
+                for written in self._label(remaining, progress):
+                    if isinstance(written, Entry):
+                        journal.add(written)
                     else:
-                        faults.append(outcome)
+                        faults.append(written)
                 entries = journal.close()
             return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
-    def _kept(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
+    def _label(self, remaining: Set[ScanFile], progress: Progress) -> Iterator[Entry | str]:
+        """Label some of the scans; yield the entry of each, or why it is broken."""
+        segmented = [scan for scan in self.scans if scan in remaining]
+        if self.drives is not None:  # labels also depend on the scans around
+            segmented = self.drives.in_reach(self.scans, remaining)
+
+        def write(outcome: Outcome) -> Entry | str | None:
+            return self.write_or_explain(outcome) if outcome.scan in remaining else None
+
+        for written in self.stream(segmented, write, progress=progress):
+            if written is not None:
+                yield written
+
+    def _kept(self, settings: Mapping[str, Any]) -> dict[str, Entry]:
         """Return the entries of an earlier run with equal settings that stay in the journal.
 
         The entries of other scans stay, so that a run over all scans can be resumed later. If the
         run is resumed, scans that are still done stay too, and need not be segmented again.
         """
-        kept = dict(earlier)
+        earlier = read_journals(self.output.folder)
+        changed = earlier.changed(settings)
+        if self.output.resume:
+            advice = "start over with --overwrite instead of --resume"
+            check_unchanged(self.output.folder, changed, advice)
+        if changed:
+            return {}
+
+        kept = dict(earlier.entries)
         for scan in self.scans:
-            entry = earlier.get(_key(scan))
+            entry = kept.get(_key(scan))
             if entry is not None and not (self.output.resume and self._is_done(scan, entry)):
                 del kept[entry.scan]
         return kept
 
-    def _is_done(self, scan: InputScan, entry: Entry) -> bool:
+    def _is_done(self, scan: ScanFile, entry: Entry) -> bool:
         """Return whether the files of a scan of an earlier run exist and are still right.
 
         The scan has not changed, nor have the first scans of its recording, which decide how it is
@@ -167,12 +175,8 @@ class Pipeline:
     @cached_property
     def _origins(self) -> dict[str, str]:
         """The digests for `Entry.origin`, by scan."""
-        recordings: dict[str, list[InputScan]] = {}
-        for scan in self.scans:
-            recordings.setdefault(scan.source, []).append(scan)
-
         origins = {}
-        for scans in recordings.values():
+        for scans in by_recording(self.scans).values():
             files = [(scan.name, *_size_and_time(scan.path)) for scan in scans]
             for index, scan in enumerate(scans):
                 values: list[Any] = [files[index][1:], files[:MEASURED_SCANS]]
@@ -184,7 +188,7 @@ class Pipeline:
 
     def stream(
         self,
-        scans: Sequence[InputScan],
+        scans: Sequence[ScanFile],
         write: Callable[[Outcome], Written],
         writers: int = 1,
         progress: Progress = no_progress,
@@ -192,8 +196,7 @@ class Pipeline:
         """Read, segment and write scans; only a few are in memory at a time.
 
         Args:
-            write: takes the outcomes in order, except that scans that cannot be read may come
-                earlier. `writers` other threads call it.
+            write: takes the outcomes in order. `writers` other threads call it.
             progress: called as scans are segmented; a drive's scans are written much later.
 
         Yields:
@@ -220,63 +223,69 @@ class Pipeline:
             while writing:
                 yield writing.popleft().result()
 
-    def _segment_group(
-        self, group: Sequence[tuple[InputScan, Future[LoadedScan]]]
-    ) -> list[Outcome]:
-        """Wait for scans that are being read, and segment them together.
-
-        Scans that cannot be read come first in the list.
-        """
-        outcomes: list[Outcome] = []
-        loaded: list[tuple[InputScan, LoadedScan]] = []
+    def _segment_group(self, group: Sequence[tuple[ScanFile, Future[Scan]]]) -> list[Outcome]:
+        """Wait for scans that are being read, and segment them together, in their order."""
+        outcomes: dict[ScanFile, Outcome] = {}
+        loaded: list[tuple[ScanFile, Scan]] = []
         for scan, load in group:
             try:
                 with memory_for(scan.name):
                     loaded.append((scan, load.result()))
             except InputError as error:
-                outcomes.append((scan, None, error))
-        return outcomes + self._segment_loaded(loaded)
+                outcomes[scan] = Broken(scan, error)
+        for outcome in self._segment_loaded(loaded):
+            outcomes[outcome.scan] = outcome
+        return [outcomes[scan] for scan, _ in group]
 
-    def _segment_loaded(self, loaded: Sequence[tuple[InputScan, LoadedScan]]) -> list[Outcome]:
+    def _segment_loaded(self, loaded: Sequence[tuple[ScanFile, Scan]]) -> list[Outcome]:
         """Segment scans together; if that fails, segment them one by one to find broken ones."""
         if not loaded:
             return []
+        scans, points = zip(*loaded, strict=True)
         try:
-            with memory_for(loaded[0][0].name):
-                results = self.segment(
-                    [scan for scan, _ in loaded], [item.scan for _, item in loaded]
-                )
-            return [(*pair, result) for pair, result in zip(loaded, results, strict=True)]
+            with memory_for(scans[0].name):
+                results = self.segment(scans, points)
+            return list(map(Labelled, scans, points, results))
         except InputError as error:
             if len(loaded) == 1:
-                return [(loaded[0][0], None, error)]
+                return [Broken(scans[0], error)]
         return list(chain.from_iterable(self._segment_loaded([pair]) for pair in loaded))
 
     def write_or_explain(self, outcome: Outcome) -> Entry | str:
         """Write the files of a scan; return its entry, or a line that says why it is broken."""
-        scan, loaded, result = outcome
-        if loaded is None or isinstance(result, InputError):
-            return str(result)
-        return self.write(scan, loaded, result)
+        return str(outcome.error) if isinstance(outcome, Broken) else self.write(outcome)
 
-    def write(self, scan: InputScan, loaded: LoadedScan, result: Segmentation) -> Entry:
+    def write(self, labelled: Labelled) -> Entry:
         """Write the files of a scan, the labels last: if they exist, the other files exist."""
-        folder = self.output.folder
-        scores_path = inside(folder, scan.scores_path)
-        if self.output.scores:
+        scan, loaded, result = labelled.scan, labelled.loaded, labelled.result
+        output = self.output
+        scores_path = inside(output.folder, scan.scores_path)
+        if output.scores:
             write_scores(scores_path, result)
-        if self.output.uncertain:
+        if output.uncertain:
             write_uncertain(scores_path.with_suffix(UNCERTAIN_ENDING), result.uncertain)
 
-        scan.write_labels(folder, loaded, result, self.output.kind)
+        scan.dataset.write_labels(
+            scan,
+            output.folder,
+            loaded,
+            result.labels,
+            taxonomy=output.taxonomy,
+            kind=output.kind,
+            uncertain=result.uncertain if result.has_two_networks else None,
+        )
 
-        points = int(np.count_nonzero(loaded.scan.valid))
-        uncertain = round(result.doubt * points)
-        key = _key(scan)
-        own = np.zeros(len(result), bool) if loaded.scan.own is None else loaded.scan.own
-        counts = np.bincount(result.labels[~own]).tolist()
-        values = key, self._origins[key], scan.source, points, uncertain, counts
-        return Entry(*values, int(np.count_nonzero(own)))
+        own = np.zeros(len(result), bool) if loaded.own is None else loaded.own
+        points = int(np.count_nonzero(loaded.valid))
+        return Entry(
+            scan=_key(scan),
+            origin=self._origins[_key(scan)],
+            sensor=scan.recording.name,
+            points=points,
+            uncertain=round(result.doubt * points),
+            counts=np.bincount(result.labels[~own]).tolist(),
+            own=int(np.count_nonzero(own)),
+        )
 
 
 def _counted(outcomes: Iterable[Outcome], total: int, progress: Progress) -> Iterator[Outcome]:
@@ -300,7 +309,7 @@ def check_faults(faults: Sequence[str], total: int) -> None:
         )
 
 
-def check_output(scans: Sequence[InputScan], output: OutputOptions) -> None:
+def check_output(scans: Sequence[ScanFile], output: OutputOptions) -> None:
     """Check that the files of some scans may be written; call this before any long work.
 
     The files of the run that is resumed may be replaced.
@@ -338,7 +347,7 @@ def check_output(scans: Sequence[InputScan], output: OutputOptions) -> None:
     check_outputs(new_files, inputs, output.overwrite or is_killed)
 
 
-def _check_names(scans: Sequence[InputScan]) -> None:
+def _check_names(scans: Sequence[ScanFile]) -> None:
     """Raise InputError if two scans would have the same files."""
     paths: set[Path] = set()
     for scan in scans:
@@ -350,7 +359,7 @@ def _check_names(scans: Sequence[InputScan]) -> None:
         paths.add(scan.scores_path)
 
 
-def _check_folder(scan: InputScan, output: OutputOptions) -> None:
+def _check_folder(scan: ScanFile, output: OutputOptions) -> None:
     """Raise InputError if output files would lie among the scans and look like scans."""
     labels_look_like_scans = f".{output.kind}" in COLUMN_READERS
     scores_look_like_scans = output.scores and scan.path.suffix.lower() == ".npz"
@@ -372,7 +381,7 @@ def _size_and_time(path: Path) -> tuple[int, int]:
     return status.st_size, status.st_mtime_ns
 
 
-def _key(scan: InputScan) -> str:
+def _key(scan: ScanFile) -> str:
     return str(scan.scores_path)
 
 

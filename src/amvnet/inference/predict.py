@@ -8,9 +8,10 @@ from itertools import chain
 from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.inference.drive import DriveOptions, Drives, find_poses, key_of
+from amvnet.data.recordings import ScanFile
+from amvnet.inference.drive import DriveOptions, Drives, find_poses
 from amvnet.inference.journal import Entry
-from amvnet.inference.listing import Inputs, InputScan
+from amvnet.inference.listing import Inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_output
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation
@@ -60,8 +61,7 @@ def predict(
     """
     classes = request.classes
     normaliser = Normaliser(request.weights.expects, request.sensor, report)
-    written = None if classes is None else classes.target
-    scans, _ = inputs.scans(request.weights.taxonomy, normaliser, written, official=True)
+    scans, _ = inputs.scans(request.weights.taxonomy, normaliser, official=True)
     check_output(scans, output)
     drives = None
     if drive is not None:
@@ -89,8 +89,8 @@ def segment_by(
     """Return a function that segments scans, with labels in other classes and fused over drives."""
     table = None if classes is None else classes.table(segmenter.taxonomy)
 
-    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
-        yaws = None if drives is None else [drives.yaws[key_of(scan)] for scan in inputs]
+    def segment(inputs: Sequence[ScanFile], scans: Sequence[Scan]) -> list[Segmentation]:
+        yaws = None if drives is None else [drives.yaws[scan] for scan in inputs]
         results = segmenter.many(scans, yaws)
         if table is None:
             return results

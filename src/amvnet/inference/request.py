@@ -11,11 +11,11 @@ from typing import Any
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.compute import EngineName, Precision
 from amvnet.files import digest, size_and_time
-from amvnet.inference.drive import Drives, key_of
-from amvnet.inference.listing import InputScan
+from amvnet.inference.drive import Drives
 from amvnet.inference.pipeline import UNCERTAIN_ENDING, OutputOptions
 from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method, check_two_networks
@@ -101,10 +101,10 @@ class LabellingRequest:
             "drive": self.drive,
         }
 
-    def digest_of(self, scans: Sequence[InputScan], drives: Drives | None) -> str:
+    def digest_of(self, scans: Sequence[ScanFile], drives: Drives | None) -> str:
         """Return a digest of all that the scores of some scans depend on, and of their poses."""
         stamps = {path: size_and_time(path) for path in {scan.path for scan in scans}}
-        files = [(*key_of(scan), stamps[scan.path]) for scan in scans]
+        files = [(scan.recording.name, scan.name, stamps[scan.path]) for scan in scans]
         settings = self.settings | {"engine": self.engine}  # which rounds scores in its own way
         return digest(repr((files, None if drives is None else drives.digest, settings)))
 
@@ -119,6 +119,7 @@ class LabellingRequest:
         return OutputOptions(
             folder,
             self.kind,
+            None if self.classes is None else self.classes.target,
             scores=self.scores,
             uncertain=self.uncertain,
             overwrite=overwrite,

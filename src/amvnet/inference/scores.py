@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.recordings import ScanFile
 from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import Scan
 
@@ -149,7 +149,7 @@ class ScorePair:
         """Return the probabilities f and g of a scan, as `ScoreFolder.read` returns them."""
         return self.a.read(prediction, scan, classes), self.b.read(prediction, scan, classes)
 
-    def digests(self, records: Sequence[ScanRecord]) -> dict[str, str]:
+    def digests(self, records: Sequence[ScanFile]) -> dict[str, str]:
         """Return a digest of each model's scores by side; it does not depend on the folders."""
         return {scores.side: _digest(scores, records) for scores in (self.a, self.b)}
 
@@ -224,7 +224,7 @@ def check_finite(values: np.ndarray, name: str) -> None:
         )
 
 
-def _digest(scores: ScoreFolder, records: Sequence[ScanRecord]) -> str:
+def _digest(scores: ScoreFolder, records: Sequence[ScanFile]) -> str:
     """Return a digest of the scores of some scans, by the size and the end of each file."""
     digest = hashlib.sha256(repr((scores.side, scores.logits)).encode())
 

@@ -34,7 +34,6 @@ class Origin:
         usual_uncertain: the share of uncertain points in the validation of the weights, in [0, 1];
             None if it is not known for this tau.
         path: the file of the scan; None if the scan was in memory.
-        file_xyz: (N, 3) the unchanged coordinates of the file; None if the scan was in memory.
     """
 
     scan: Scan
@@ -42,7 +41,6 @@ class Origin:
     method: str
     usual_uncertain: float | None
     path: Path | None = None
-    file_xyz: np.ndarray | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -139,7 +137,8 @@ class Segmentation:
     def points(self) -> NDArray[np.floating]:
         """(N, 3) x, y, z of the points, as in the scan's file or in the array that was given."""
         origin = self.require_origin()
-        return origin.scan.points[:, :3] if origin.file_xyz is None else origin.file_xyz
+        scan = origin.scan
+        return scan.points[:, :3] if scan.file_xyz is None else scan.file_xyz
 
     @property
     def class_names(self) -> tuple[str, ...]:

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from amvnet.data.datasets.open import is_dataset
 from amvnet.data.formats.rows import parse_layout
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
-from amvnet.inference.listing import Inputs, InputScan, ScanOptions, find_inputs
+from amvnet.inference.listing import Inputs, ScanOptions, find_inputs
 from amvnet.inference.reading import array_cloud, array_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
@@ -197,21 +198,18 @@ class Segmenter:
         inputs = find_inputs(list(map(str, paths)), options)
         return map(self._segment_input, self._list(inputs))
 
-    def _list(self, inputs: Inputs) -> list[InputScan]:
+    def _list(self, inputs: Inputs) -> list[ScanFile]:
         """Return the scans of some inputs, normalised to the weights when they are read."""
         return inputs.scans(self.taxonomy, self._normaliser())[0]
 
     def _normaliser(self) -> Normaliser:
         return Normaliser(self.weights.expects, self.sensor)
 
-    def _segment_input(self, scan: InputScan, yaw: float = 0.0) -> Segmentation:
+    def _segment_input(self, scan: ScanFile, yaw: float = 0.0) -> Segmentation:
         """Read and segment a scan."""
-        loaded = scan.load(labels=True)
-        result = self(loaded.scan, yaw=yaw)
-
+        result = self(scan.load(labels=True), yaw=yaw)
         assert result.origin is not None
-        origin = replace(result.origin, path=scan.path, file_xyz=loaded.file_xyz)
-        return replace(result, origin=origin)
+        return replace(result, origin=replace(result.origin, path=scan.path))
 
     def batch(self, scans: Sequence[Scan], yaws: Sequence[float] | None = None) -> PointBatch:
         """Return the P valid points of some scans, prepared for the networks, as one batch.

@@ -77,7 +77,7 @@ class Estimate:
         return "; ".join(texts)
 
 
-class Recording:
+class Measured:
     """What is assumed about the scans of one recording.
 
     The first `MEASURED_SCANS` scans are measured, and each scan gets the median of their estimates.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.formats.cloud import Cloud, usual_scale
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.errors import InputError, errors_of
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
@@ -25,7 +26,7 @@ from amvnet.sensors.lidars import ANY, UNITS, Sensor, make_sensor, rotation_from
 from amvnet.sensors.measure import (
     MEASURED_SCANS,
     Estimate,
-    Recording,
+    Measured,
     median_of,
     raise_points,
     seen_scan,
@@ -119,9 +120,10 @@ class Normaliser:
         self.expected = expected
         self.sensor = sensor or Sensor()
         self._report = report
-        self._first: dict[str, list[Callable[[], Cloud]]] = {}
-        self._recordings: dict[str, Recording] = {}
-        self._assumed: dict[str, str] = {}  # the lines by recording, and by its other sensors
+        self._measured: dict[Recording | str, Measured] = {}
+        self._latest: Recording | None = None  # the one that was measured last
+        # What was assumed of the usual sensor of each recording, and of its other sensors.
+        self._assumed: dict[tuple[Recording | str, bool], str] = {}
         self._turned: set[str] = set()  # what was reported of scans that are only turned
         self._described: list[tuple[str, Estimate]] = []  # notes and estimates in these lines
 
@@ -129,35 +131,40 @@ class Normaliser:
         """Report nothing more."""
         self._report = report_nothing
 
-    def expect(self, source: str, read: Callable[[], Cloud]) -> None:
-        """Announce the next scan of a source, before any scan is normalised.
+    def scan(self, file: ScanFile) -> Scan:
+        """Read a scan as the weights expect it; it keeps the coordinates of its file.
 
-        The first scans of the source are then measured even if another process or run normalises
-        them.
+        Raises:
+            InputError: if it cannot be read; or as `__call__`.
         """
-        first = self._first.setdefault(source, [])
-        if len(first) < MEASURED_SCANS:
-            first.append(read)
+        if self.expected is not None:
+            self.measure(file.recording)  # which may keep this scan in memory
+        cloud = file.recording.read(file)
+        return dataclasses.replace(self(cloud, file.recording), file_xyz=cloud.xyz)
 
-    def __call__(self, cloud: Cloud, source: str) -> Scan:
+    def __call__(self, cloud: Cloud, recording: Recording | str) -> Scan:
         """Return a scan as the weights expect it; its points keep their order and number.
+
+        Args:
+            recording: the recording, or the name of one in memory.
 
         Raises:
             InputError: if no point is usable, or the unit of the coordinates is in doubt.
         """
         if self.expected is None:
-            return self._turn(cloud, source)
+            return self._turn(cloud, recording)
 
-        recording = self.measure(source)
-        estimate, is_usual = recording.estimate(cloud)
+        source = recording if isinstance(recording, str) else recording.name
+        measured = self.measure(recording)
+        estimate, is_usual = measured.estimate(cloud)
         self._check_height(cloud, estimate.frame)
         scan, ring_fault = normalise(cloud, estimate, self.sensor, self.expected)
 
-        title = source if is_usual else f"{source}, other sensors"
-        is_new = title not in self._assumed
-        if is_new or recording.is_mixed:
+        key = (recording, is_usual)
+        is_new = key not in self._assumed
+        if is_new or measured.is_mixed:
             line = describe(cloud, estimate, self.sensor, self.expected, ring_fault)
-            if recording.is_mixed:
+            if measured.is_mixed:
                 line += f"; {source} has scans of other sensors, so that each is measured alone"
             if not is_usual:
                 line += f"; another sensor or scale of intensity than {source} begins with"
@@ -165,12 +172,12 @@ class Normaliser:
             stated = estimate.contradiction(self.sensor)
             if stated:
                 lines.append(f"warning: {cloud.name}: you state {stated}; correct the sensor")
-            self._assumed[title] = "; ".join(lines)
+            self._assumed[key] = "; ".join(lines)
             is_described = self._is_described(cloud, estimate)
-            if (is_new and (not is_usual or recording.is_mixed)) or not is_described:
+            if (is_new and (not is_usual or measured.is_mixed)) or not is_described:
                 for line in lines:
                     self._report(line)
-        return dataclasses.replace(scan, assumed=self._assumed[title])
+        return dataclasses.replace(scan, assumed=self._assumed[key])
 
     def _is_described(self, cloud: Cloud, estimate: Estimate) -> bool:
         for note, other in self._described:
@@ -179,22 +186,29 @@ class Normaliser:
         self._described.append((cloud.note, estimate))
         return False
 
-    def measure(self, source: str) -> Recording:
-        """Return the recording of a source. The first call measures its announced scans."""
-        if source not in self._recordings:
-            self._begin(source).learn(self._first.pop(source, []))
-        return self._recordings[source]
+    def measure(self, recording: Recording | str) -> Measured:
+        """Return what is measured of a recording; the first call measures its first scans.
 
-    def recall(self, measured: Mapping[str, Estimate | None]) -> None:
-        """Normalise the scans of some sources by estimates that were measured before."""
-        for source, usual in measured.items():
-            self._begin(source).recall(usual)
+        They are measured even if another process or run normalises them.
+        """
+        if recording not in self._measured:
+            measured = self._begin(recording)
+            if isinstance(recording, Recording):
+                if self._latest is not None:
+                    self._latest.forget()
+                self._latest = recording
+                measured.learn(recording.first(MEASURED_SCANS))
+        return self._measured[recording]
 
-    def _begin(self, source: str) -> Recording:
+    def recall(self, measured: Mapping[Recording, Estimate | None]) -> None:
+        """Normalise the scans of some recordings by estimates that were measured before."""
+        for recording, usual in measured.items():
+            self._begin(recording).recall(usual)
+
+    def _begin(self, recording: Recording | str) -> Measured:
         assert self.expected is not None
-        recording = Recording(self.sensor, self.expected.sensor.height)
-        self._recordings[source] = recording
-        return recording
+        self._measured[recording] = Measured(self.sensor, self.expected.sensor.height)
+        return self._measured[recording]
 
     def for_sensor(self, sensor: Sensor) -> Normaliser:
         """Return a normaliser for the same weights and the scans of a described sensor."""
@@ -209,8 +223,8 @@ class Normaliser:
         the rows of the range image are rings, they are the lasers that decide the rows instead.
         """
         assert self.expected is not None
-        recordings = self._recordings.values()
-        medians = [recording.usual for recording in recordings if recording.usual is not None]
+        usual = [measured.usual for measured in self._measured.values()]
+        medians = [estimate for estimate in usual if estimate is not None]
         lasers = self.expected.lasers
         height = self.expected.sensor.height
         if medians:
@@ -230,13 +244,14 @@ class Normaliser:
                 f"found {frame.height:.1f}; give --unit ft if these are feet, else --height"
             )
 
-    def _turn(self, cloud: Cloud, source: str) -> Scan:
+    def _turn(self, cloud: Cloud, recording: Recording | str) -> Scan:
         """Return a scan that is only turned, by the description of the sensor."""
         xyz = self.sensor.to_level(cloud.xyz)
         scale = self.sensor.intensity_scale or cloud.intensity_scale()
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
 
-        if source not in self._assumed:
+        key = (recording, True)
+        if key not in self._assumed:
             has_intensity = cloud.intensity is not None and scale is not None
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
             negative = _describe_negative(cloud)
@@ -245,14 +260,12 @@ class Normaliser:
             if assumed not in self._turned:
                 self._report(f"{cloud.name}: assumed {assumed}")
             self._turned.add(assumed)
-            self._assumed[source] = f"{cloud.name}: assumed {assumed}"
-        return dataclasses.replace(
-            scan, to_file=self.sensor.to_file(), assumed=self._assumed[source]
-        )
+            self._assumed[key] = f"{cloud.name}: assumed {assumed}"
+        return dataclasses.replace(scan, to_file=self.sensor.to_file(), assumed=self._assumed[key])
 
 
 def normalised(
-    dataset: Dataset, normaliser: Normaliser, measured: Mapping[str, Estimate | None] = {}
+    dataset: Dataset, normaliser: Normaliser, measured: Mapping[Recording, Estimate | None] = {}
 ) -> Dataset:
     """Return a dataset whose scans are normalised as scan files are.
 
@@ -270,9 +283,6 @@ def normalised(
     if dataset.described_sensor is not None and not normaliser.sensor.is_known:
         normaliser = normaliser.for_sensor(described_sensor(dataset))
 
-    for source, scans in dataset.recordings().items():
-        for scan in scans:
-            normaliser.expect(source, scan.read)
     normaliser.recall(measured)
     return dataset.normalised_by(normaliser)
 

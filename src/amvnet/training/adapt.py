@@ -13,13 +13,13 @@ import numpy as np
 
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import Recipe
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.labels.ids import write_array
+from amvnet.data.recordings import ScanFile, by_recording, distinct
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, inside, temporary_folder
-from amvnet.inference.drive import Drives, key_of
-from amvnet.inference.listing import InputScan, LoadedScan
+from amvnet.inference.drive import Drives, Labelled
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
@@ -67,32 +67,39 @@ class TaughtScans(Dataset):
     `Dataset` documents the methods and their errors.
     """
 
-    def __init__(self, scans: Sequence[InputScan], folder: Path, weights: Weights) -> None:
+    def __init__(self, scans: Sequence[ScanFile], folder: Path, weights: Weights) -> None:
         super().__init__(folder, weights.taxonomy)
-        self._scans = {label_path(scan): scan for scan in scans}
+        self._scans = dict(zip(label_paths(scans), scans, strict=True))
 
     def parts(self) -> dict[str, tuple[str, ...]]:
         """Return the recordings; all of them train."""
-        recordings = tuple(dict.fromkeys(scan.source for scan in self._scans.values()))
+        recordings = tuple(recording.name for recording in by_recording(self._scans.values()))
         return {"train": recordings, "all": recordings}
 
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+    def records(self, sequences: Sequence[str]) -> list[ScanFile]:
         """Return the scans of some recordings, in order."""
         records = []
         for path, scan in self._scans.items():
-            if scan.source in sequences:
-                labels = self.root / path
-                name = str(path.with_suffix(""))
-                records.append(ScanRecord(name, scan.source, scan.path, labels, str(path)))
+            record = ScanFile(
+                name=str(path.with_suffix("")),
+                recording=scan.recording,
+                path=scan.path,
+                sequence=scan.recording.name,
+                labels_path=self.root / path,
+                prediction=str(path),
+                dataset=self,
+            )
+            if record.sequence in sequences:
+                records.append(record)
         return records
 
-    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+    def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan, normalised to the weights, and what its consensus teaches."""
-        scan = self._scans[Path(record.prediction)].load().scan
+        scan = self._scans[Path(record.prediction)].load()
         ids = self.raw_labels(record, len(scan)) if labels else None
         return replace(scan, labels=ids, name=record.name)
 
-    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+    def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Return the (N,) train ids that teach; 0 for points that teach nothing."""
         assert record.labels_path is not None
         ids: np.ndarray = np.load(record.labels_path, allow_pickle=False)
@@ -103,14 +110,22 @@ class TaughtScans(Dataset):
         return np.arange(self.taxonomy.size + 1, dtype=np.int16)
 
 
-def label_path(scan: InputScan) -> Path:
-    """Return the path of the labels that a scan teaches, relative to their folder."""
-    recording = scan.source.strip("/").replace("/", "_")
-    return Path(recording) / scan.scores_path.with_suffix(".npy").name
+def label_paths(scans: Sequence[ScanFile]) -> list[Path]:
+    """Return the paths of the labels that scans teach, relative to their folder, all different.
+
+    The scans come recording by recording, as `Inputs.scans` returns them.
+    """
+    recordings = by_recording(scans)
+    folders = distinct(name.name.strip("/").replace("/", "_") for name in recordings)
+    paths = []
+    for folder, members in zip(folders, recordings.values(), strict=True):
+        for name in distinct(scan.scores_path.stem for scan in members):
+            paths.append(Path(folder) / f"{name}.npy")
+    return paths
 
 
 def teach(
-    scans: Sequence[InputScan],
+    scans: Sequence[ScanFile],
     drives: Drives | None,
     segmenter: Segmenter,
     folder: Path | None = None,
@@ -128,7 +143,9 @@ def teach(
     """
     counts = np.zeros(4)  # of points, of uncertain ones, and of those that agree in two ways
     taught = 0
-    for scan, result, probabilities, sights in _fused(scans, drives, segmenter, progress):
+    paths = label_paths(scans)
+    fused = _fused(scans, drives, segmenter, progress)
+    for path, (result, probabilities, sights) in zip(paths, fused, strict=True):
         is_valid = result.labels > 0
         labels = np.where(probabilities.any(axis=1), probabilities.argmax(axis=1) + 1, 0)
         assert result.rv is not None
@@ -143,7 +160,7 @@ def teach(
             teaches = (probabilities.max(axis=1) > LEAST_PROBABILITY) & (sights >= LEAST_SIGHTS)
             ids = np.where(teaches, labels, 0).astype(np.uint8)
             taught += int(np.count_nonzero(ids))
-            with atomic_write(inside(folder, label_path(scan))) as part:
+            with atomic_write(inside(folder, path)) as part:
                 write_array(part, ids)
     if folder is not None and not taught:
         seen = "" if drives is None else f" in voxels that {LEAST_SIGHTS} scans see"
@@ -155,26 +172,27 @@ def teach(
 
 
 def _fused(
-    scans: Sequence[InputScan], drives: Drives | None, segmenter: Segmenter, progress: Progress
-) -> Iterator[tuple[InputScan, Segmentation, np.ndarray, np.ndarray]]:
-    """Yield each scan, its result, and the probabilities (N, K) and sights (N,) of its points."""
+    scans: Sequence[ScanFile], drives: Drives | None, segmenter: Segmenter, progress: Progress
+) -> Iterator[tuple[Segmentation, np.ndarray, np.ndarray]]:
+    """Yield the result of each scan, and the probabilities (N, K) and sights (N,) of its points."""
 
-    def segment(scan: InputScan, loaded: LoadedScan) -> tuple[InputScan, LoadedScan, Segmentation]:
-        yaw = 0.0 if drives is None else drives.yaws[key_of(scan)]
-        return scan, loaded, segmenter(loaded.scan, yaw=yaw)
+    def segment(scan: ScanFile, loaded: Scan) -> Labelled:
+        yaw = 0.0 if drives is None else drives.yaws[scan]
+        return Labelled(scan, loaded, segmenter(loaded, yaw=yaw))
 
     outcomes = stream_scans(scans, lambda scan: scan.load(), segment, segmenter.at_once, progress)
     if drives is not None:
-        for (scan, _, result), probabilities, sights in drives.consensus_of(outcomes):
-            assert isinstance(result, Segmentation)
-            yield scan, result, probabilities, sights
+        for outcome, probabilities, sights in drives.consensus_of(outcomes):
+            assert isinstance(outcome, Labelled)
+            yield outcome.result, probabilities, sights
         return
-    for scan, _, result in outcomes:
-        yield scan, result, result.probabilities, np.full(len(result), LEAST_SIGHTS)
+    for outcome in outcomes:
+        result = outcome.result
+        yield result, result.probabilities, np.full(len(result), LEAST_SIGHTS)
 
 
 def adapt(
-    scans: Sequence[InputScan],
+    scans: Sequence[ScanFile],
     drives: Drives | None,
     weights: Weights,
     make_segmenter: Callable[[Weights], Segmenter],

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from amvnet.config.schema import HeadTraining
-from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.training_data import TrainingData
+from amvnet.data.recordings import ScanFile
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
 from amvnet.inference.scores import LEAST_PROBABILITY
@@ -34,7 +34,7 @@ from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights
 
 # Takes a scan and the batch of its P valid points. Returns the probabilities f and g, (P, K).
-Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]
+Scorer = Callable[[ScanFile, Scan, PointBatch], tuple[Tensor, Tensor]]
 
 # U uncertain points: their features p_i (U, 2 K + 4), the features of their neighbours S_i
 # (U, n, 2 K + 4), their train ids (U,), and the number of uncertain points of its scan that each
@@ -194,13 +194,13 @@ class PointGatherer:
             return self._read_scores
         model = self.plan.build(self.weights).to(self._device)
 
-        def score(record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
+        def score(record: ScanFile, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
             return model.score(*model.project(batch))
 
         return score
 
     def _read_scores(
-        self, record: ScanRecord, scan: Scan, batch: PointBatch
+        self, record: ScanFile, scan: Scan, batch: PointBatch
     ) -> tuple[Tensor, Tensor]:
         assert self.plan.scores is not None
         classes = self.weights.taxonomy.size

@@ -321,9 +321,9 @@ def _report_recordings(dataset: Dataset, normaliser: Normaliser, report: Reporte
     The processes that read them report nothing.
     """
     recordings = dataset.recordings()
-    for source, scans in list(recordings.items())[:MAX_MEASURED_RECORDINGS]:
+    for recording in recordings[:MAX_MEASURED_RECORDINGS]:
         with suppress(InputError):  # the check of the scans reports broken ones
-            normaliser(scans[0].read(), source)
+            normaliser.scan(recording.scans[0])
     more = len(recordings) - MAX_MEASURED_RECORDINGS
     rest = f"; {counted(more, 'further recording')} not shown" if more > 0 else ""
     report(f"{dataset.spec}: if an assumption is wrong, state the right value under sensor{rest}")

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from amvnet.data.recordings import ScanFile
 from amvnet.errors import InputError
-from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import (
     Origin,
@@ -83,7 +83,7 @@ def check_labels(labels: Path, count: int) -> None:
 
 
 def show_scans(
-    scans: Sequence[InputScan],
+    scans: Sequence[ScanFile],
     segmenter: Segmenter | None = None,
     labels: Path | None = None,
     progress: Progress = no_progress,
@@ -99,11 +99,11 @@ def show_scans(
         InputError: if a file is broken or missing.
     """
 
-    def load(scan_input: InputScan) -> LoadedScan:
+    def load(scan_input: ScanFile) -> Scan:
         return scan_input.load(labels=True)
 
-    def show(scan_input: InputScan, loaded: LoadedScan) -> ShownScan:
-        scan = check_scan(loaded.scan)
+    def show(scan_input: ScanFile, loaded: Scan) -> ShownScan:
+        scan = check_scan(loaded)
         if segmenter is not None:
             result = segmenter(scan)
             assert result.origin is not None
@@ -118,8 +118,8 @@ def show_scans(
             corrected=scan_input.corrected,
         )
         if labels is not None:
-            ids = scan_input.read_labels(labels, len(scan))
-        elif (stored := scan_input.stored_labels(len(scan))) is not None:
+            ids = scan_input.dataset.read_prediction(scan_input, labels, len(scan))
+        elif (stored := scan_input.dataset.stored_labels(scan_input, len(scan))) is not None:
             ids = stored
             shown = _near_the_middle(shown)
         else:

@@ -12,7 +12,8 @@ from amvnet.errors import InputError, SomeBroken
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
-    from amvnet.data.datasets.base import Dataset, ScanRecord
+    from amvnet.data.datasets.base import Dataset
+    from amvnet.data.recordings import ScanFile
 
 
 def check(data: str, /, choice: TrainingChoice) -> None:
@@ -41,8 +42,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
             f"the beginning of one: name its classes, and run amvnet check {shlex.quote(str(path))}"
         )
     dataset = open_dataset(data)
-    recordings = dataset.recordings().values()
-    scans = [scan.read for recording in recordings for scan in recording]
+    scans = [scan.read for recording in dataset.recordings() for scan in recording.scans]
     body = measure_body(scans, described_sensor(dataset))
     if body is not None:
         report(
@@ -61,7 +61,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     report(f"{counted(usable, 'scan')} can be trained on or scored")
 
 
-def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanRecord]]) -> int:
+def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanFile]]) -> int:
     """Print what is in the labels of some scans, and return the number of scans.
 
     If something must be corrected, raise InputError; if only some scans are broken, SomeBroken.

@@ -22,7 +22,8 @@ from amvnet.models.methods import PAPER_METHODS, MethodName, check_method, metho
 from amvnet.sensors.lidars import AUTO
 
 if TYPE_CHECKING:
-    from amvnet.data.datasets.base import Dataset, ScanRecord
+    from amvnet.data.datasets.base import Dataset
+    from amvnet.data.recordings import ScanFile
     from amvnet.evaluation.metrics import Evaluation
     from amvnet.inference.drive import Drives
 
@@ -73,7 +74,7 @@ def evaluate(
     from amvnet.files import make_folder
     from amvnet.outputs import check_outputs
 
-    def check_files(records: Sequence[ScanRecord]) -> None:
+    def check_files(records: Sequence[ScanFile]) -> None:
         """Check that all files can be written, before time is spent on networks and scans."""
         outputs = {} if pictures is None else pictures_of(records, pictures)
         if json is not None:
@@ -121,7 +122,7 @@ def evaluate(
 
 
 def _find_drives(
-    choice: DriveChoice, dataset: Dataset, records: Sequence[ScanRecord], processes: int
+    choice: DriveChoice, dataset: Dataset, records: Sequence[ScanFile], processes: int
 ) -> Drives | None:
     """Return the poses of the scans, if their scores are to be fused over time.
 
@@ -129,16 +130,14 @@ def _find_drives(
         InputError: if several processes would share the scans, or there are no poses that fit.
     """
     from amvnet.inference.drive import find_poses
-    from amvnet.inference.listing import DatasetScan
 
     options = choice.parse()
     if options is None:
         return None
     if processes > 1:
         raise InputError("--drive: expected one process, found several; start it without torchrun")
-    scans = [DatasetScan(dataset, record) for record in records]
     with progress("poses") as step:
-        return find_poses(scans, options.poses, options.past_only, progress=step, report=report)
+        return find_poses(records, options.poses, options.past_only, progress=step, report=report)
 
 
 def _check_methods(methods: tuple[MethodName, ...], weights: str, parts: tuple[str, ...]) -> None:

@@ -4,48 +4,31 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from amvnet.data.datasets.split import Names, Split
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.find import NamedScan
 from amvnet.data.labels.ids import check_count, read_ids, train_ids, write_ids
 from amvnet.data.poses import Poses
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
 from amvnet.progress import counted
 from amvnet.scan import Scan
 
-# Turns the points of a file into a scan, given the name of the recording.
-Normalise = Callable[[Cloud, str], Scan]
 
+class Normalise(Protocol):
+    """Makes scans as some weights expect them."""
 
-@dataclass(frozen=True)
-class ScanRecord:
-    """The files of one scan of a dataset.
+    def scan(self, file: ScanFile) -> Scan:
+        """Read a scan; it keeps the coordinates of its file."""
 
-    Attributes:
-        name: unique in its dataset: "08/000001", or the sample_data token.
-        sequence: "08", or the name of the scene.
-        labels_path: the file of the labels, or None if the sequence has none.
-        prediction: path of the scan's prediction, relative to a folder of predictions.
-    """
-
-    name: str
-    sequence: str
-    points_path: Path
-    labels_path: Path | None
-    prediction: str
-
-    @property
-    def has_labels(self) -> bool:
-        """Whether the file of the labels exists."""
-        return self.labels_path is not None and self.labels_path.is_file()
+    def __call__(self, cloud: Cloud, recording: Recording | str) -> Scan:
+        """Return the scan of points in memory."""
 
 
 class Dataset(ABC):
@@ -59,6 +42,7 @@ class Dataset(ABC):
         described_sensor: what a description of the dataset says of the sensor, if anything.
         ids_advice: what a user can do about an unknown id in labels; None is advice on files.
         normalise: makes scans of the points in the files; without it, points stay unchanged.
+        finish: takes each scan that `ScanFile.load` reads, and returns it as labels need it.
     """
 
     readers = 8
@@ -66,6 +50,7 @@ class Dataset(ABC):
     described_sensor: str | Mapping[str, Any] | None = None
     ids_advice: str | None = None
     normalise: Normalise | None = None
+    finish: Callable[[Scan], Scan] | None = None
 
     def __init__(self, root: Path | str, taxonomy: Taxonomy, spec: str | None = None) -> None:
         self.root = Path(root)
@@ -113,7 +98,7 @@ class Dataset(ABC):
         return names
 
     @abstractmethod
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+    def records(self, sequences: Sequence[str]) -> list[ScanFile]:
         """Return the scans of these sequences, sorted by sequence and then by time.
 
         Raises:
@@ -121,7 +106,7 @@ class Dataset(ABC):
         """
 
     @abstractmethod
-    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+    def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan.
 
         Args:
@@ -131,22 +116,22 @@ class Dataset(ABC):
             InputError: if a file is missing, truncated, empty or does not fit its scan.
         """
 
-    def recordings(self) -> dict[str, list[NamedScan]]:
-        """Return the scans that `normalise` can change, in order, by the name of the recording.
+    def recordings(self) -> list[Recording]:
+        """Return the recordings that `normalise` can change.
 
         Scans of the benchmarks stay unchanged, because weights are trained on such scans.
         """
-        return {}
+        return []
 
     def normalised_by(self, normalise: Normalise) -> Dataset:
         """Return the dataset with its `recordings` normalised."""
         return self
 
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+    def at_epoch(self, record: ScanFile, epoch: int) -> ScanFile:
         """Return the scan that takes a scan's place in an epoch: in most datasets, the scan."""
         return record
 
-    def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+    def labelled(self, records: Sequence[ScanFile]) -> list[ScanFile]:
         """Return the scans to train on or to score: those that have labels.
 
         Raises:
@@ -162,11 +147,11 @@ class Dataset(ABC):
             )
         return labelled
 
-    def having_labels(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+    def having_labels(self, records: Sequence[ScanFile]) -> list[ScanFile]:
         """Return the scans that have labels, which may be none."""
         return [record for record in records if record.has_labels]
 
-    def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
+    def poses(self, records: Sequence[ScanFile]) -> Poses | None:
         """Return the poses (N, 4, 4) of the LiDAR in scans of one sequence, or None if unknown.
 
         Raises:
@@ -174,20 +159,20 @@ class Dataset(ABC):
         """
         return None
 
-    def files_of(self, record: ScanRecord) -> list[Path]:
+    def files_of(self, record: ScanFile) -> list[Path]:
         """Return the files of a scan: its points and labels, which no output may replace."""
-        files = (record.points_path, record.labels_path)
+        files = (record.path, record.labels_path)
         return [path for path in files if path is not None]
 
-    def read_unchanged(self, record: ScanRecord) -> Scan:
+    def read_unchanged(self, record: ScanFile) -> Scan:
         """Read the points of one scan as in its file; raise the errors of `read`."""
         return self.read(record, labels=False)
 
-    def place_of_labels(self, record: ScanRecord) -> Path:
+    def place_of_labels(self, record: ScanFile) -> Path:
         """Return the file that holds the labels of a scan, or its prediction if none may."""
         return record.labels_path or self.root / record.prediction
 
-    def labels(self, record: ScanRecord, count: int) -> np.ndarray | None:
+    def labels(self, record: ScanFile, count: int) -> np.ndarray | None:
         """Read the (N,) uint8 train ids of a scan of N = `count` points; None if it has no labels.
 
         Raises:
@@ -200,7 +185,7 @@ class Dataset(ABC):
         return train_ids(path, raw, self.taxonomy, self.ids_advice, self.train_ids_by_raw())
 
     @abstractmethod
-    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+    def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Read the (N,) raw ids of a scan that has labels and N = `count` points, unchecked.
 
         Raises:
@@ -211,23 +196,39 @@ class Dataset(ABC):
         """Return the int16 train ids by raw id (`raw_labels`), UNKNOWN for ids to refuse."""
         return self.taxonomy.train_ids_by_raw
 
-    def count_points(self, record: ScanRecord) -> int:
+    def count_points(self, record: ScanFile) -> int:
         """Return the number of points of a scan; raise the errors of `read`."""
         return len(self.read(record, labels=False))
 
-    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
+    def place_of_prediction(self, record: ScanFile, kind: str) -> Path:
+        """Return the path of a scan's prediction, relative to a folder of predictions.
+
+        `kind` is the format of scan files, one of `writers.KINDS`; datasets have their own format.
+        """
+        return Path(record.prediction)
+
+    def stored_labels(self, record: ScanFile, count: int) -> np.ndarray | None:
+        """Return the (N,) train ids that `predict` or `map` wrote next to N = `count` points."""
+        return None
+
+    def read_prediction(
+        self, record: ScanFile, folder: Path, count: int | None = None
+    ) -> np.ndarray:
         """Read the (N,) uint8 train ids (0..K) that were predicted for a scan.
+
+        Args:
+            count: N, if it is known; else it is read from the scan's file.
 
         Raises:
             InputError: if the file is missing, has another number of points or an unknown id.
         """
         path = Path(folder) / record.prediction
-        raw = read_ids(path, _id_type(path), self.count_points(record))
+        raw = read_ids(path, _id_type(path), count or self.count_points(record))
         return train_ids(path, raw, self.taxonomy, "write the predictions with these ids")
 
     def write_prediction(
         self,
-        record: ScanRecord,
+        record: ScanFile,
         folder: Path,
         ids: np.ndarray,
         taxonomy: Taxonomy | None = None,
@@ -244,9 +245,29 @@ class Dataset(ABC):
         """
         if count is None:
             count = self.count_points(record)
-        ids = check_count(ids, record.points_path, count)
+        ids = check_count(ids, record.path, count)
         path = inside(folder, record.prediction)
         return write_ids(path, (taxonomy or self.taxonomy).to_raw(ids), _id_type(path))
+
+    def write_labels(
+        self,
+        record: ScanFile,
+        folder: Path,
+        scan: Scan,
+        ids: np.ndarray,
+        *,
+        taxonomy: Taxonomy | None = None,
+        kind: str = "label",
+        uncertain: np.ndarray | None = None,
+    ) -> Path:
+        """Write the (N,) train ids of a scan that was read: `write_prediction`.
+
+        Args:
+            kind: as for `place_of_prediction`.
+            uncertain: (N,) bool, the uncertain points, which some kinds also hold.
+        """
+        # The file may have vanished since it was read.
+        return self.write_prediction(record, folder, ids, taxonomy, count=len(scan))
 
 
 def not_trained_on(unseen: Sequence[str]) -> str:
@@ -262,8 +283,6 @@ def _id_type(path: Path) -> type[np.unsignedinteger]:
     return np.uint8 if path.suffix == ".bin" else np.uint32
 
 
-def choose_records(
-    dataset: Dataset, sequences: Sequence[str] | None, split: str
-) -> list[ScanRecord]:
+def choose_records(dataset: Dataset, sequences: Sequence[str] | None, split: str) -> list[ScanFile]:
     """Return the scans of the named sequences, or of a split if there are no names."""
     return dataset.records(dataset.sequences(split) if sequences is None else sequences)

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord, not_trained_on
+from amvnet.data.datasets.base import Dataset, not_trained_on
 from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
 from amvnet.data.poses import Poses
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError, one_line_errors, reason_of, shown
 from amvnet.files import checked_token
@@ -76,7 +77,7 @@ class NuScenes(Dataset):
             label_rows = self._table("lidarseg", required=False)
             self._label_files = {row["sample_data_token"]: row["filename"] for row in label_rows}
             self._category_train_ids = self._category_lookup() if label_rows else None
-            self._records_by_scene = self._read_records()
+            self._recordings = self._read_recordings()
 
     @staticmethod
     def matches(root: Path) -> bool:
@@ -94,8 +95,8 @@ class NuScenes(Dataset):
         folder = self.root / "samples" / CHANNEL
         file_names = set(os.listdir(folder)) if folder.is_dir() else set()
         on_disk = set()
-        for scene, records in self._records_by_scene.items():
-            if any(record.points_path.name in file_names for record in records):
+        for scene, recording in self._recordings.items():
+            if any(record.path.name in file_names for record in recording.scans):
                 on_disk.add(scene)
 
         splits = {}
@@ -122,30 +123,30 @@ class NuScenes(Dataset):
                 "mini_val".
         """
         scenes = []
-        for scene in sorted(self._records_by_scene):
+        for scene in sorted(self._recordings):
             official = self._split(scene)
             if split in ("all", official, official.removeprefix("mini_")):
                 scenes.append(scene)
         return tuple(scenes)
 
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+    def records(self, sequences: Sequence[str]) -> list[ScanFile]:
         """Return the scans of these scenes, in order."""
-        missing = sorted(set(sequences) - set(self._records_by_scene))
+        missing = sorted(set(sequences) - set(self._recordings))
         if missing:
-            scenes = sorted(self._records_by_scene)
+            scenes = sorted(self._recordings)
             raise InputError(
                 f"{self.root}: expected the scene {missing[0]} in {self.version}, found no such "
                 f"scene in its tables; name one of {', '.join(scenes[:MAX_LISTED])}"
             )
 
-        records: list[ScanRecord] = []
+        records: list[ScanFile] = []
         for scene in sorted(set(sequences)):
-            records.extend(self._records_by_scene[scene])
+            records.extend(self._recordings[scene].scans)
         return records
 
-    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+    def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan, with the ring of every point."""
-        path = record.points_path
+        path = record.path
         table = read_table(path, np.float32, NUSCENES_COLUMNS)
         points = check_usable(np.ascontiguousarray(table[:, :4]), path)
         points[:, 3] /= FULL_INTENSITY
@@ -159,7 +160,7 @@ class NuScenes(Dataset):
         ids = self.labels(record, len(points)) if labels else None
         return Scan(points, labels=ids, ring=ring, name=record.name)
 
-    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+    def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Read the (N,) indices in category.json of the points of one scan."""
         assert record.labels_path is not None
         return read_ids(record.labels_path, np.uint8, count)
@@ -169,7 +170,7 @@ class NuScenes(Dataset):
         assert self._category_train_ids is not None  # no record has labels without this table
         return self._category_train_ids
 
-    def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+    def labelled(self, records: Sequence[ScanFile]) -> list[ScanFile]:
         """Return the scans; raise InputError if the tables have no labels at all."""
         if not self._label_files:
             raise InputError(
@@ -178,7 +179,7 @@ class NuScenes(Dataset):
             )
         return list(records)
 
-    def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
+    def poses(self, records: Sequence[ScanFile]) -> Poses | None:
         """Return the poses of the LiDAR, from the tables of the car's poses and of its sensors."""
         with self._using_tables():
             ego = self._motions("ego_pose")
@@ -201,13 +202,13 @@ class NuScenes(Dataset):
         motions[:, :3, :3] = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
         return dict(zip([row["token"] for row in rows], motions, strict=True))
 
-    def count_points(self, record: ScanRecord) -> int:
+    def count_points(self, record: ScanFile) -> int:
         """Return the number of points of a scan, from the size of its file."""
-        return count_rows(record.points_path, np.float32, NUSCENES_COLUMNS)
+        return count_rows(record.path, np.float32, NUSCENES_COLUMNS)
 
     def write_prediction(
         self,
-        record: ScanRecord,
+        record: ScanFile,
         folder: Path,
         ids: np.ndarray,
         taxonomy: Taxonomy | None = None,
@@ -287,8 +288,8 @@ class NuScenes(Dataset):
             table[row["index"]] = train_id
         return table
 
-    def _read_records(self) -> dict[str, list[ScanRecord]]:
-        """Read the tables; return the scans of every scene, by its name, in order of time."""
+    def _read_recordings(self) -> dict[str, Recording]:
+        """Read the tables; return every scene by its name, with its scans in order of time."""
         scene_names = {row["token"]: row["name"] for row in self._table("scene")}
         scene_of_sample = {}
         for row in self._table("sample"):
@@ -297,24 +298,27 @@ class NuScenes(Dataset):
         rows = list(filter(_is_scan, self._table("sample_data")))
         rows.sort(key=lambda row: (row["timestamp"], row["token"]))
 
-        records: dict[str, list[ScanRecord]] = {}
+        recordings: dict[str, Recording] = {}
         for row in rows:
             scene = scene_of_sample[row["sample_token"]]
-            records.setdefault(scene, []).append(self._record(row, scene))
-        return records
+            recording = recordings.setdefault(scene, Recording(scene))
+            recording.scans.append(self._record(row, scene, recording))
+        return recordings
 
-    def _record(self, row: Row, scene: str) -> ScanRecord:
+    def _record(self, row: Row, scene: str, recording: Recording) -> ScanFile:
         token = checked_token(row["token"])
         labels_path = None
         if token in self._label_files:
             labels_path = self.root / self._label_files[token]
 
-        return ScanRecord(
+        return ScanFile(
             name=token,
+            recording=recording,
+            path=self.root / row["filename"],
             sequence=scene,
-            points_path=self.root / row["filename"],
             labels_path=labels_path,
             prediction=f"lidarseg/{self._split(scene)}/{token}_lidarseg.bin",
+            dataset=self,
         )
 
     def _split(self, scene: str) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.description import ENDINGS, is_description
+from amvnet.data.datasets.files import ScanFiles
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
@@ -49,7 +50,7 @@ def with_classes(dataset: Dataset, classes: Taxonomy) -> Dataset:
     """
     if dataset.taxonomy.classes == classes.classes:
         return dataset
-    if isinstance(dataset, OwnScans):
+    if isinstance(dataset, OwnScans | ScanFiles):
         return dataset.with_classes(classes)
     check_classes(dataset.spec, dataset.taxonomy, classes)
     return dataset

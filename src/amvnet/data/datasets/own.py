@@ -11,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, Normalise, ScanRecord
+from amvnet.data.datasets.base import Dataset, Normalise
 from amvnet.data.datasets.description import SPLITS, WILDCARDS, Description, below, read_description
 from amvnet.data.datasets.split import Split
-from amvnet.data.formats.find import ANY_FOLDERS, NamedScan, list_scans, matching, scan_stem
+from amvnet.data.formats.detect import scan_stem
+from amvnet.data.formats.find import ANY_FOLDERS, list_scans, matching
 from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.poses import Poses, read_poses, times_of
+from amvnet.data.recordings import Recording, ScanFile, by_recording
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError, did_you_mean, readable, reason_of, shown
 from amvnet.progress import counted
@@ -33,11 +35,18 @@ class OwnScans(Dataset):
     sequence with labels is cut even without a split.
     """
 
-    def __init__(self, description: Description, normalise: Normalise | None = None) -> None:
+    def __init__(
+        self,
+        description: Description,
+        normalise: Normalise | None = None,
+        scans: dict[str, ScanFile] | None = None,
+    ) -> None:
         super().__init__(description.root, description.taxonomy, str(description.path))
         self.description = description
         self.described_sensor = description.sensor
         self.normalise = normalise
+        if scans is not None:
+            self._scans = scans
         self._counts: dict[str, int] = {}  # points of the scans that have been read, by name
 
     def parts(self) -> dict[str, tuple[str, ...]]:
@@ -67,7 +76,7 @@ class OwnScans(Dataset):
             f"split, such as {split}: [{self._listing[-1][0].name}], or name sequences to use"
         )
 
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+    def records(self, sequences: Sequence[str]) -> list[ScanFile]:
         """Return the scans of these sequences, in order."""
         present = self.parts()["all"]
         for name in sequences:
@@ -78,9 +87,10 @@ class OwnScans(Dataset):
                 )
 
         chosen = [record for record, _ in self._listing if record.sequence in sequences]
-        return sorted(chosen, key=lambda record: (record.sequence, record.name))
+        # The scans of a recording stay in order, even if the split cuts it into sequences.
+        return sorted(chosen, key=lambda record: (self._folder_of(record.name), record.name))
 
-    def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+    def labelled(self, records: Sequence[ScanFile]) -> list[ScanFile]:
         """Return the scans that have labels."""
         labelled = [record for record in records if record.labels_path is not None]
 
@@ -90,9 +100,7 @@ class OwnScans(Dataset):
             if self.description.unread is not None:
                 check_classes(self.spec, self.description.unread, self.taxonomy)
             if place is not None:
-                scan = self._scans[records[0].name]
-                path = place.path_of(scan.path, scan.name)
-                found = f"no {path}"
+                found = f"no {self._place_of(records[0].name)}"
                 if len(records) > 1:
                     found += f", and none for the other {len(records) - 1} scans"
             raise InputError(
@@ -101,22 +109,20 @@ class OwnScans(Dataset):
             )
         return labelled
 
-    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+    def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan."""
-        named = self._scans[record.name]
-        cloud = named.read()
-        scan = cloud.to_scan() if self.normalise is None else self.normalise(cloud, named.source)
+        scan = record.read().to_scan() if self.normalise is None else self.normalise.scan(record)
         self._counts[record.name] = len(scan)
         ids = self.labels(record, len(scan)) if labels else None
-        return dataclasses.replace(scan, labels=ids, name=record.name)
+        return dataclasses.replace(scan, labels=ids, name=record.name, file_xyz=None)
 
-    def read_unchanged(self, record: ScanRecord) -> Scan:
+    def read_unchanged(self, record: ScanFile) -> Scan:
         """Read the points of one scan as they are in its file."""
-        scan = self._scans[record.name].read().to_scan()
+        scan = record.read().to_scan()
         self._counts[record.name] = len(scan)
         return dataclasses.replace(scan, name=record.name)
 
-    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+    def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Read the (N,) raw ids of one scan."""
         place = self.description.labels
         assert place is not None
@@ -125,7 +131,7 @@ class OwnScans(Dataset):
         missing = self.taxonomy.train_to_raw[0]
         return read_raw_labels(record.labels_path, count, place.field, layout, missing=missing)
 
-    def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
+    def poses(self, records: Sequence[ScanFile]) -> Poses | None:
         """Return the poses that the description names; a file has those of all its folder's scans.
 
         They belong to the scans in order. If the file has times and another number of poses, they
@@ -142,55 +148,55 @@ class OwnScans(Dataset):
             poses |= zip(names, read_poses(path).at(times, len(names)), strict=True)
         return np.array([poses[record.name] for record in records])
 
-    def _poses_file(self, scan: NamedScan) -> Path:
+    def _poses_file(self, scan: ScanFile) -> Path:
         return below(scan.path.parent, self.description.poses)
 
-    def count_points(self, record: ScanRecord) -> int:
+    def count_points(self, record: ScanFile) -> int:
         """Return the number of points of a scan; the file is not read a second time."""
         if record.name not in self._counts:
-            self._counts[record.name] = len(self._scans[record.name].read().xyz)
+            self._counts[record.name] = len(record.read().xyz)
         return self._counts[record.name]
 
-    def recordings(self) -> dict[str, list[NamedScan]]:
-        """Return the scans of each recording, in order: files of one folder and one ending."""
-        recordings: dict[str, list[NamedScan]] = {}
-        for scan in self._scans.values():
-            recordings.setdefault(scan.source, []).append(scan)
-        return recordings
+    def recordings(self) -> list[Recording]:
+        """Return the recordings: the files of one folder and one ending."""
+        return list(by_recording(record for record, _ in self._listing))
 
     def normalised_by(self, normalise: Normalise) -> OwnScans:
         """Return the same scans, normalised."""
-        return OwnScans(self.description, normalise)
+        return OwnScans(self.description, normalise, self._scans)
 
     def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
         """Return the same scans with other classes for predictions; labels are not read."""
         description = dataclasses.replace(
             self.description, taxonomy=taxonomy, unread=self.description.unread or self.taxonomy
         )
-        return OwnScans(description, self.normalise)
+        return OwnScans(description, self.normalise, self._scans)
 
-    def place_of_labels(self, record: ScanRecord) -> Path:
+    def place_of_labels(self, record: ScanFile) -> Path:
         """Return the file that holds the labels of a scan, or its prediction if none may."""
         place = self.description.labels
         if place is None or place.field is not None:  # labels in a column cannot be replaced alone
             return self.root / record.prediction
-        scan = self._scans[record.name]
-        return place.path_of(scan.path, scan.name)
+        return self._place_of(record.name)
 
-    def files_of(self, record: ScanRecord) -> list[Path]:
+    def _place_of(self, name: str) -> Path:
+        """Return the file that holds the labels of a scan, if the description names any."""
+        scan = self._scans[name]
+        assert self.description.labels is not None
+        return self.description.labels.path_of(scan.path, scan.name)
+
+    def files_of(self, record: ScanFile) -> list[Path]:
         """Return the files of a scan, with its poses, and its labels even if they are not read."""
         files = super().files_of(record)
-        scan = self._scans[record.name]
-        place = self.description.labels
-        if place is not None:
-            files.append(place.path_of(scan.path, scan.name))
+        if self.description.labels is not None:
+            files.append(self._place_of(record.name))
         if self.description.poses:
-            files.append(self._poses_file(scan))
+            files.append(self._poses_file(record))
         return files
 
     @cached_property
-    def _scans(self) -> dict[str, NamedScan]:
-        """The scans by name: the path from `root`, without the ending."""
+    def _scans(self) -> dict[str, ScanFile]:
+        """The scans in their files, by name: the path from `root`, without the ending."""
         pattern = self.description.scans
         try:
             if ANY_FOLDERS in Path(pattern).parts:  # Python's own does not follow links
@@ -211,12 +217,13 @@ class OwnScans(Dataset):
         if place is not None and place.file is not None:
             label_paths = {place.path_of(path, scan_stem(path)) for path in paths}
 
-        scans: dict[str, NamedScan] = {}
+        scans: dict[str, ScanFile] = {}
+        folders: dict[str, Recording] = {}
         for path in paths:
             if path in label_paths:
                 continue
 
-            for scan in list_scans(path, layout=self.description.layout):
+            for scan in list_scans(path, layout=self.description.layout, folders=folders):
                 name = (scan.path.parent.relative_to(self.root) / scan.name).as_posix()
                 if name in scans:
                     raise InputError(
@@ -233,8 +240,9 @@ class OwnScans(Dataset):
         return scans
 
     @cached_property
-    def _listing(self) -> list[tuple[ScanRecord, str]]:
+    def _listing(self) -> list[tuple[ScanFile, str]]:
         """The records of all scans, each with its split ("" if it is in none)."""
+        fixed = _fixed_part(self.description.scans)
         splits = self._splits()
         splits_of_folder: dict[str, set[str]] = {}
         for name, split in splits.items():
@@ -242,16 +250,19 @@ class OwnScans(Dataset):
 
         listing = []
         for name, scan in self._scans.items():
+            place = Path(name).parent.relative_to(fixed).as_posix()
+            scan.recording.name = fixed.name or "all" if place == "." else place
             sequence = self._folder_of(name)
             if len(splits_of_folder[sequence]) > 1:
                 sequence = f"{sequence}-{splits[name] or 'rest'}"
 
-            record = ScanRecord(
+            record = dataclasses.replace(
+                scan,
                 name=name,
                 sequence=sequence,
-                points_path=scan.path,
                 labels_path=self._labels.get(name) if self.description.unread is None else None,
                 prediction=f"{name}.label",
+                dataset=self,
             )
             listing.append((record, splits[name]))
         return listing
@@ -261,9 +272,9 @@ class OwnScans(Dataset):
         """The label files that exist, by the name of the scan."""
         place = self.description.labels
         paths = {}
-        for name, scan in self._scans.items():
+        for name in self._scans:
             if place is not None:
-                path = place.path_of(scan.path, scan.name)
+                path = self._place_of(name)
                 with readable(f"{self.spec}: labels: {shown(str(path))}"):
                     if path.is_file():
                         paths[name] = path

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord, not_trained_on
+from amvnet.data.datasets.base import Dataset, not_trained_on
 from amvnet.data.formats.cloud import check_usable
 from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import check_bits, read_ids
 from amvnet.data.poses import Poses, read_poses
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -66,36 +67,36 @@ class SemanticKitti(Dataset):
             f"add one, or name {not_trained_on(unseen)}"
         )
 
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+    def records(self, sequences: Sequence[str]) -> list[ScanFile]:
         """Return the scans of these sequences, in order."""
-        records: list[ScanRecord] = []
+        records: list[ScanFile] = []
         for sequence in sorted(set(sequences)):
             records += self._records(sequence)
         return records
 
-    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+    def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan."""
-        path = record.points_path
+        path = record.path
         points = check_usable(read_table(path, np.float32, KITTI_COLUMNS), path)
         ids = self.labels(record, len(points)) if labels else None
         return Scan(points, labels=ids, name=record.name)
 
-    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+    def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Read the (N,) raw ids of one scan."""
         assert record.labels_path is not None
         return check_bits(record.labels_path, read_ids(record.labels_path, np.uint32, count))
 
-    def poses(self, records: Sequence[ScanRecord]) -> Poses | None:
+    def poses(self, records: Sequence[ScanFile]) -> Poses | None:
         """Return the poses of the LiDAR, from poses.txt and calib.txt of the sequence."""
         path = self._folder / records[0].sequence / "poses.txt"
         if not path.is_file():
             return None
         # The line of a pose is the number of its scan.
-        return read_poses(path).numbered([record.points_path.stem for record in records])
+        return read_poses(path).numbered([record.path.stem for record in records])
 
-    def count_points(self, record: ScanRecord) -> int:
+    def count_points(self, record: ScanFile) -> int:
         """Return the number of points of a scan, from the size of its file."""
-        return count_rows(record.points_path, np.float32, KITTI_COLUMNS)
+        return count_rows(record.path, np.float32, KITTI_COLUMNS)
 
     @property
     def _folder(self) -> Path:
@@ -105,30 +106,32 @@ class SemanticKitti(Dataset):
     def _sequences_on_disk(self) -> tuple[str, ...]:
         return tuple(sorted(path.parent.name for path in self._folder.glob("*/velodyne")))
 
-    def _records(self, sequence: str) -> list[ScanRecord]:
+    def _records(self, sequence: str) -> list[ScanFile]:
         folder = self._folder / sequence
         labelled = {path.name for path in (folder / "labels").glob("*.label")}
 
-        records = []
+        recording = Recording(sequence)
         for path in sorted((folder / "velodyne").glob("*.bin")):
             # A program that was killed may have left an unfinished file, hidden by a leading dot.
             if path.name.startswith("."):
                 continue
 
             labels_path = folder / "labels" / f"{path.stem}.label"
-            record = ScanRecord(
+            record = ScanFile(
                 name=f"{sequence}/{path.stem}",
+                recording=recording,
+                path=path,
                 sequence=sequence,
-                points_path=path,
                 labels_path=labels_path if labels_path.name in labelled else None,
                 prediction=f"sequences/{sequence}/predictions/{path.stem}.label",
+                dataset=self,
             )
-            records.append(record)
+            recording.scans.append(record)
 
-        if not records:
+        if not recording.scans:
             raise InputError(
                 f"{folder / 'velodyne'}: expected the scans *.bin of sequence {sequence}, "
                 f"found none; name one of {', '.join(self._sequences_on_disk())}"
             )
 
-        return records
+        return recording.scans

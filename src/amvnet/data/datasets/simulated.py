@@ -17,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, Normalise, ScanRecord
+from amvnet.data.datasets.base import Dataset, Normalise
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.labels.ids import write_array
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError, one_line_errors, shown
 from amvnet.files import temporary_folder
@@ -81,20 +82,24 @@ class SimulatedStreets(Dataset):
         val = tuple(map(_name, range(FIRST_VAL_STREET, FIRST_VAL_STREET + VAL_STREETS)))
         return {"train": train, "val": val, "all": (*train, *val)}
 
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+    def records(self, sequences: Sequence[str]) -> list[ScanFile]:
         """Return the scans of these streets, in order."""
-        numbers = {self._number(sequence) for sequence in sequences}
-        return [self._record(number, index) for number in sorted(numbers) for index in range(SCANS)]
+        records = []
+        for number in sorted({self._number(sequence) for sequence in sequences}):
+            recording = Recording(_name(number))
+            recording.scans += [self._record(number, index, recording) for index in range(SCANS)]
+            records += recording.scans
+        return records
 
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+    def at_epoch(self, record: ScanFile, epoch: int) -> ScanFile:
         """Return the same scan of the epoch's street; streets to validate with do not change."""
         number = int(record.sequence)
         if number >= FIRST_VAL_STREET:
             return record
 
         shift = epoch * STREET_STEP
-        index = int(record.points_path.name)
-        return self._record((number + shift) % FIRST_VAL_STREET, index)
+        index = int(record.path.name)
+        return self._record((number + shift) % FIRST_VAL_STREET, index, record.recording)
 
     def normalised_by(self, normalise: Normalise) -> Dataset:
         """Return the same streets, with scans that are normalised if their sensor asks for it."""
@@ -102,11 +107,11 @@ class SimulatedStreets(Dataset):
             return self
         return SimulatedStreets(self.root, self.simulated_sensor, normalise)
 
-    def having_labels(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+    def having_labels(self, records: Sequence[ScanFile]) -> list[ScanFile]:
         """Return all scans: labels are simulated with them."""
         return list(records)
 
-    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+    def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Return the (N,) train ids of the points: the cache has no raw ids."""
         labels = self.read(record).labels
         assert labels is not None
@@ -116,7 +121,7 @@ class SimulatedStreets(Dataset):
         """Return each train id as its own raw id."""
         return np.arange(self.taxonomy.size + 1, dtype=np.int16)
 
-    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+    def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan; simulate its street if it is not in the cache."""
         scan = self._read(record, labels)
         if self.normalise is None:
@@ -125,9 +130,9 @@ class SimulatedStreets(Dataset):
         cloud = Cloud(scan.points[:, :3], scan.points[:, 3], name=scan.name)
         return dataclasses.replace(self.normalise(cloud, scan.name), labels=scan.labels)
 
-    def _read(self, record: ScanRecord, labels: bool) -> Scan:
+    def _read(self, record: ScanFile, labels: bool) -> Scan:
         """Return a scan as its sensor writes it; raise the errors of `read`."""
-        street = record.points_path.parent
+        street = record.path.parent
         with suppress(FileNotFoundError):
             os.utime(street)  # marks the street as just read, so that other processes keep it
             return self._load(record, labels)
@@ -153,22 +158,24 @@ class SimulatedStreets(Dataset):
             )
         return int(sequence)
 
-    def _record(self, number: int, index: int) -> ScanRecord:
+    def _record(self, number: int, index: int, recording: Recording) -> ScanFile:
         sequence = _name(number)
         scan = _name(index)
         folder = self.root / f"streets-{self.simulated_sensor}-{_simulator()}" / sequence / scan
 
-        return ScanRecord(
+        return ScanFile(
             name=f"{sequence}/{scan}",
+            recording=recording,
+            path=folder,
             sequence=sequence,
-            points_path=folder,
             labels_path=folder / "labels.npy",
             prediction=f"sequences/{sequence}/predictions/{scan}.label",
+            dataset=self,
         )
 
-    def _load(self, record: ScanRecord, labels: bool) -> Scan:
+    def _load(self, record: ScanFile, labels: bool) -> Scan:
         """Read a scan from the cache; raise FileNotFoundError if the cache lacks it."""
-        folder = record.points_path
+        folder = record.path
 
         try:
             return Scan(

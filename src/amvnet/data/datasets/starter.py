@@ -15,8 +15,8 @@ import numpy as np
 
 from amvnet.data.datasets.description import ENDINGS, LabelPlace
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.detect import named_ending
-from amvnet.data.formats.find import list_scans, scan_stem
+from amvnet.data.formats.detect import named_ending, scan_stem
+from amvnet.data.formats.find import list_scans
 from amvnet.data.labels.readers import COLUMNS, read_raw_labels
 from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import INSTANCE_MASK

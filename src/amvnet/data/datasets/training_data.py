@@ -11,9 +11,10 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.simulated import SCANS
-from amvnet.data.formats.find import scan_stem
+from amvnet.data.formats.detect import scan_stem
+from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.files import digest
@@ -37,9 +38,9 @@ class Source:
     """
 
     dataset: Dataset
-    train: Sequence[ScanRecord]
-    val: Sequence[ScanRecord] = ()
-    unlabelled: Sequence[ScanRecord] = ()
+    train: Sequence[ScanFile]
+    val: Sequence[ScanFile] = ()
+    unlabelled: Sequence[ScanFile] = ()
 
     def __post_init__(self) -> None:
         names = {record.name for record in self.train}
@@ -104,7 +105,7 @@ class TrainingData:
                 if _identity(record) in apart:
                     raise InputError(
                         "expected scans to train on apart from those to validate or to test with, "
-                        f"found {record.points_path} among both; leave it out of "
+                        f"found {record.path} among both; leave it out of "
                         f"{other.dataset.spec}"
                     )
             classes = other.dataset.taxonomy.classes
@@ -121,7 +122,7 @@ class TrainingData:
         return self.sources[0].dataset.taxonomy
 
     @property
-    def val(self) -> Sequence[ScanRecord]:
+    def val(self) -> Sequence[ScanFile]:
         """The scans to validate with."""
         return self.sources[0].val
 
@@ -146,7 +147,7 @@ class TrainingData:
         return [first, *others]
 
     @cached_property
-    def train(self) -> list[ScanRecord]:
+    def train(self) -> list[ScanFile]:
         """The scans of the first epoch, under the names that they have in the files of a run.
 
         A name begins with the numbers of the source and of the place, if it is not of the first
@@ -170,7 +171,7 @@ class TrainingData:
             classes.append((taxonomy.classes, sorted(taxonomy.raw_to_train.items(), key=str)))
         return digest(repr(classes))
 
-    def in_epoch(self, number: int, epoch: int = 0) -> list[ScanRecord]:
+    def in_epoch(self, number: int, epoch: int = 0) -> list[ScanFile]:
         """Return the scans of a source in an epoch, in the order of their places."""
         return [self._turn(number, place, epoch) for place in range(self.places[number])]
 
@@ -190,7 +191,7 @@ class TrainingData:
         scan = self.sources[number].dataset.read(self._turn(number, index, epoch), labels)
         return dataclasses.replace(scan, source=np.full(len(scan), number))
 
-    def _turn(self, number: int, place: int, epoch: int) -> ScanRecord:
+    def _turn(self, number: int, place: int, epoch: int) -> ScanFile:
         """Return the scan of a source whose turn it is at a place in an epoch."""
         source = self.sources[number]
         turn = (epoch * self.places[number] + place) % len(source.train)
@@ -199,24 +200,24 @@ class TrainingData:
         return source.dataset.at_epoch(source.train[turn], epoch)
 
 
-def digest_of_scans(records: Sequence[ScanRecord]) -> str:
+def digest_of_scans(records: Sequence[ScanFile]) -> str:
     """Return a digest of the names of some scans and the sizes of their files."""
     sizes = []
     for record in records:
-        path = record.points_path
+        path = record.path
         sizes.append((record.name, path.stat().st_size if path.is_file() else None))
     return digest(repr(sizes))
 
 
-def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
+def sequence_names(records: Sequence[ScanFile]) -> list[str]:
     """Return the sorted names of the sequences of some scans, each once."""
     return sorted({record.sequence for record in records})
 
 
-def _identity(record: ScanRecord) -> tuple[str, str]:
+def _identity(record: ScanFile) -> tuple[str, str]:
     """Return what identifies a scan in any dataset: its file, and its name in a bag."""
-    in_file = record.name.partition(f"{scan_stem(record.points_path)}/")[2]
-    return os.path.realpath(record.points_path), in_file
+    in_file = record.name.partition(f"{scan_stem(record.path)}/")[2]
+    return os.path.realpath(record.path), in_file
 
 
 @cache

@@ -120,3 +120,13 @@ def named_ending(path: Path) -> str | None:
 def is_dead_link(path: Path) -> bool:
     """Return whether a path is a link to something that does not exist."""
     return path.is_symlink() and not path.exists()
+
+
+def scan_stem(path: Path) -> str:
+    """Return a scan file's name without its ending, such as `.pcd.bin`."""
+    name = path.absolute().name if path.name in ("", "..") else path.name
+    if path.is_dir():
+        return name
+    ending = named_ending(Path(name)) or path.suffix
+    stem = name[: len(name) - len(ending)]
+    return scan_stem(path.with_name(stem)) if ending == GZIP else stem

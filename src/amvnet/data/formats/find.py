@@ -5,9 +5,9 @@ from __future__ import annotations
 import glob
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -23,35 +23,16 @@ from amvnet.data.formats.detect import (
     ending_of,
     is_dead_link,
     named_ending,
+    scan_stem,
 )
 from amvnet.data.formats.registry import open_bag, read_file
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_comma_table, find_table, read_head
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.errors import InputError
 
 ANY_FOLDERS = "**"  # the part of a pattern that stands for any folders
 POSE_COLUMNS = 12  # the numbers in a line of KITTI's files of poses, a 3 x 4 matrix
-
-
-@dataclass(frozen=True)
-class NamedScan:
-    """A scan in a file or a bag that has not been read yet.
-
-    Attributes:
-        name: the scan's name, unique in one input: `000000` for the file `000000.bin`,
-            `drive/000000` for the first scan of the bag `drive.bag`.
-        source: the recording's name: the bag, or the folder and the ending of its files.
-        ending: the ending that belongs to the file's content (`ending_of`); empty for a broken
-            file.
-        bag_poses: reads the poses of all scans of a bag; None for a file.
-    """
-
-    name: str
-    source: str
-    path: Path
-    ending: str
-    read: Callable[[], Cloud]
-    bag_poses: BagPoses | None = None
 
 
 def find_scans(path: Path | str) -> list[Path]:
@@ -86,8 +67,12 @@ def find_scans(path: Path | str) -> list[Path]:
 
 
 def list_scans(
-    path: Path | str, topic: str | None = None, layout: RowLayout = UNKNOWN, is_alone: bool = True
-) -> Iterator[NamedScan]:
+    path: Path | str,
+    topic: str | None = None,
+    layout: RowLayout = UNKNOWN,
+    is_alone: bool = True,
+    folders: dict[str, Recording] | None = None,
+) -> Iterator[ScanFile]:
     """Yield the scans of the files that `find_scans` finds. A bag's scans keep their order.
 
     If one of several files cannot be opened, or is a link that leads nowhere, it is yielded as a
@@ -96,6 +81,7 @@ def list_scans(
     Args:
         topic: the topic to read in bags; by default the only one with scans.
         is_alone: whether the user names no other path.
+        folders: the recordings of earlier calls; scans of the same folders and endings join them.
 
     Raises:
         InputError: if there is no scan, or the only file has an unknown format or is a bag that
@@ -103,18 +89,22 @@ def list_scans(
     """
     files = find_scans(path)
     folder = Path(os.path.commonpath([file.parent for file in files]))
+    folders = {} if folders is None else folders
     for file in files:
         # Files in different folders can have the same name.
         name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
 
         try:
-            scans = _scans_of(file, name, topic, layout)
+            scans = _scans_of(file, name, topic, layout, folders)
         except InputError as error:
             if is_alone and len(files) == 1 and not is_dead_link(file):
                 raise
             refuse = partial(_refuse, str(error))
-            scans = [NamedScan(name, source=str(file), path=file, ending="", read=refuse)]
-        yield from scans
+            recording = Recording(str(file))
+            scans = [ScanFile(name, recording, file, prediction=f"{name}.label", read=refuse)]
+        for scan in scans:
+            scan.recording.scans.append(scan)
+            yield scan
 
 
 def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
@@ -127,7 +117,13 @@ def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
     return scans[0].read()
 
 
-def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> list[NamedScan]:
+def _scans_of(
+    file: Path,
+    name: str,
+    topic: str | None,
+    layout: RowLayout,
+    folders: dict[str, Recording],
+) -> list[ScanFile]:
     ending = ending_of(file)
     if ending not in (FOLDER, *BAGS):
         read = partial(read_file, file, ending, layout)
@@ -135,12 +131,17 @@ def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> li
         if ending == GZIP:
             ending = named_ending(Path(file.name.lower().removesuffix(GZIP))) or ""
             source = str(file.parent / f"*{ending}{GZIP}")
-        return [NamedScan(name, source, path=file, ending=ending, read=read)]
+        recording = folders.setdefault(source, Recording(source))
+        place = f"{name}.label"
+        return [ScanFile(name, recording, file, prediction=place, ending=ending, read=read)]
 
-    scans = []
+    recording = Recording(str(file))
     poses = BagPoses(file, ending, topic)
+    scans = []
     for index, read_one in enumerate(open_bag(file, ending, topic)):
-        scans.append(NamedScan(f"{name}/{index:06d}", str(file), file, ending, read_one, poses))
+        title = f"{name}/{index:06d}"
+        scan = ScanFile(title, recording, file, ending=ending, read=read_one, bag=poses)
+        scans.append(replace(scan, prediction=f"{scan.name}.label"))
     return scans
 
 
@@ -257,13 +258,3 @@ def _is_text_scan(path: Path) -> bool:
     # Reading a file with decimal commas raises an error that says what to do.
     table = find_table(head) or find_comma_table(head)
     return table is not None and (bool(table.names) or table.count != POSE_COLUMNS)
-
-
-def scan_stem(path: Path) -> str:
-    """Return a scan file's name without its ending, such as `.pcd.bin`."""
-    name = path.absolute().name if path.name in ("", "..") else path.name
-    if path.is_dir():
-        return name
-    ending = named_ending(Path(name)) or path.suffix
-    stem = name[: len(name) - len(ending)]
-    return scan_stem(path.with_name(stem)) if ending == GZIP else stem
