@@ -768,6 +768,10 @@ NUMBERS: dict[str, dict[str, float]] = {
         "LEAST_RING_POINTS": laser_order.MIN_RING_POINTS,
         "SAME_ELEVATION": laser_order.SAME_ELEVATION,
         "LEAST_POINTS": laser_order.MIN_POINTS,
+        "LEAST_MEASURED": lasers.MIN_POINTS,
+        "BINS": len(lasers.ELEVATION_EDGES) - 1,
+        "SECTORS": lasers.SECTORS,
+        "AROUND": lasers.SMOOTHED_BINS // 2,
     },
 }
 OWN_NUMBERS = {"MAX_POINTS", "LEAF", ("method/networks.js", "PART")}
