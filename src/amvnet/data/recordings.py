@@ -25,35 +25,23 @@ class Recording:
     Attributes:
         name: unique among the inputs of a command (`name_apart`).
         scans: all its scans, in order.
-        keeps: whether the first scans, which are read to measure the sensor, stay in memory until
-            they are needed, so that no file is read twice.
     """
 
     name: str
     scans: list[ScanFile] = field(default_factory=list, repr=False)
-    keeps: bool = False
-
-    def __post_init__(self) -> None:
-        self._kept: dict[str, Cloud] = {}  # by the name of the scan
+    # What was read to measure the sensor stays here until it is needed, by `ScanFile.read`.
+    kept: dict[Callable[[], Cloud], Cloud] = field(default_factory=dict, repr=False)
 
     def first(self, count: int) -> list[Callable[[], Cloud]]:
-        """Return functions that read the first scans."""
-        return [partial(self._read_first, scan) for scan in self.scans[:count]]
+        """Return functions that read the first scans, and keep them in memory."""
+        return [partial(self.read, scan, keep=True) for scan in self.scans[:count]]
 
-    def _read_first(self, scan: ScanFile) -> Cloud:
-        cloud = self.read(scan)
-        if self.keeps:
-            self._kept[scan.name] = cloud
+    def read(self, scan: ScanFile, keep: bool = False) -> Cloud:
+        """Read the points of a scan, unless they were kept; raise InputError if it is broken."""
+        cloud = self.kept.pop(scan.read, None) or scan.read()
+        if keep:
+            self.kept[scan.read] = cloud
         return cloud
-
-    def read(self, scan: ScanFile) -> Cloud:
-        """Read the points of a scan, which may be in memory; raise InputError if it is broken."""
-        cloud = self._kept.pop(scan.name, None)
-        return scan.read() if cloud is None else cloud
-
-    def forget(self) -> None:
-        """Keep no scan in memory any more."""
-        self._kept.clear()
 
 
 @dataclass(frozen=True)

@@ -116,11 +116,13 @@ class LabelScans:
             check_outside(Place.of(row["path"]), self._out)
 
         request = self.request
-        with _fetch(drive, request) as (dataset, normaliser, folder):
-            (recording,) = dataset.recordings()
+        normaliser = Normaliser(request.weights.expects, request.sensor)
+        with _fetch(drive, request.layout) as (files, folder):
             if drive[0]["estimates"]:
+                (recording,) = files.recordings()
                 normaliser.recall({recording: parse_estimate(drive[0]["estimates"])})
-            scans = dataset.records()
+            files = files.with_classes(request.weights.taxonomy)
+            scans = files.normalised_by(normaliser).records()
             pipeline = Pipeline(
                 scans,
                 segment_by(self._segmenter, request.classes),
@@ -191,10 +193,11 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     assumed = ""
     usual = None
     # A scan that cannot be read is reported as broken when it is labelled.
-    with suppress(Exception), _fetch(drive, request) as (dataset, normaliser, _):
-        (recording,) = dataset.recordings()
+    normaliser = Normaliser(request.weights.expects, request.sensor)
+    with suppress(Exception), _fetch(drive, request.layout) as (files, _):
+        (recording,) = files.recordings()
         usual = normaliser.measure(recording).usual
-        for scan, row in zip(dataset.records(), drive, strict=True):
+        for scan, row in zip(files.normalised_by(normaliser).records(), drive, strict=True):
             with suppress(InputError):  # the first scan that can be read gives the line
                 assumed = scan.load().assumed.replace(str(scan.path), _shown_path(row))
                 break
@@ -203,22 +206,12 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
 
 def choose_weights(drive: Sequence[Row], sensor: Sensor, layout: RowLayout) -> tuple[str, str]:
     """Return the name of built-in weights for a drive, and why, as `Inputs.choose_weights`."""
-    with _fetched(drive, layout) as (scans, _):
-        return Inputs([ScanFiles(scans)]).choose_weights(sensor)
+    with _fetch(drive, layout) as (scans, _):
+        return Inputs([scans]).choose_weights(sensor)
 
 
 @contextmanager
-def _fetch(
-    drive: Sequence[Row], request: LabellingRequest
-) -> Iterator[tuple[ScanFiles, Normaliser, Path]]:
-    """Yield the scans of a drive, what normalises them, and a temporary folder for labels."""
-    normaliser = Normaliser(request.weights.expects, request.sensor)
-    with _fetched(drive, request.layout) as (scans, folder):
-        yield ScanFiles(scans, request.weights.taxonomy, normaliser), normaliser, folder
-
-
-@contextmanager
-def _fetched(drive: Sequence[Row], layout: RowLayout) -> Iterator[tuple[list[ScanFile], Path]]:
+def _fetch(drive: Sequence[Row], layout: RowLayout) -> Iterator[tuple[ScanFiles, Path]]:
     """Yield the scans of a drive and a temporary folder for labels; fetch the files ahead."""
     recording = Recording(drive[0]["drive"])
     with temporary_folder() as temporary, ThreadPoolExecutor(TRANSFERS) as pool:
@@ -230,7 +223,7 @@ def _fetched(drive: Sequence[Row], layout: RowLayout) -> Iterator[tuple[list[Sca
             name = row["name"]
             scan = ScanFile(name, recording, path, prediction=f"{name}.label", read=read)
             recording.scans.append(scan)
-        yield recording.scans, temporary / "labels"
+        yield ScanFiles(recording.scans), temporary / "labels"
 
 
 def _read_fetched(fetching: Future[Path], layout: RowLayout) -> Cloud:

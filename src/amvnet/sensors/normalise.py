@@ -195,7 +195,7 @@ class Normaliser:
             measured = self._begin(recording)
             if isinstance(recording, Recording):
                 if self._latest is not None:
-                    self._latest.forget()
+                    self._latest.kept.clear()
                 self._latest = recording
                 measured.learn(recording.first(MEASURED_SCANS))
         return self._measured[recording]

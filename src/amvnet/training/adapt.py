@@ -80,17 +80,10 @@ class TaughtScans(Dataset):
         """Return the scans of some recordings, in order."""
         records = []
         for path, scan in self._scans.items():
-            record = ScanFile(
-                name=str(path.with_suffix("")),
-                recording=scan.recording,
-                path=scan.path,
-                sequence=scan.recording.name,
-                labels_path=self.root / path,
-                prediction=str(path),
-                dataset=self,
-            )
-            if record.sequence in sequences:
-                records.append(record)
+            if scan.recording.name in sequences:
+                name, labels = str(path.with_suffix("")), self.root / path
+                record = replace(scan, name=name, sequence=scan.recording.name, dataset=self)
+                records.append(replace(record, labels_path=labels, prediction=str(path)))
         return records
 
     def read(self, record: ScanFile, labels: bool = True) -> Scan:

@@ -37,8 +37,6 @@ class ScanFiles(Dataset):
         super().__init__(Path(), taxonomy)
         self._scans = [replace(scan, dataset=self) for scan in scans]
         self.normalise = normalise
-        for recording in self.recordings():
-            recording.keeps = True
 
     def parts(self) -> dict[str, tuple[str, ...]]:
         """Return no sequences: files have no splits."""
