@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from amvnet.data.poses import Poses
 from amvnet.errors import InputError
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 GAP = 50  # largest number of scans between the two of a pair that shows whether poses fit
 PAIRS = 8  # number of pairs that are compared, evenly spaced over the drive
@@ -151,6 +154,8 @@ def check_fit(pairs: Iterable[Pair], name: str, advice: str) -> Fit | None:
     Raises:
         InputError: if the poses do not fit.
     """
+    from scipy.spatial import KDTree
+
     distances = []
     for pair in pairs:
         before = _compared(pair.before)
