@@ -20,7 +20,7 @@ import torch
 
 import amvnet
 from amvnet.cli.options import load_segmenter
-from amvnet.data.recordings import ScanFile
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
@@ -676,6 +676,20 @@ def test_a_scan_that_vanishes_after_it_was_read_has_its_labels(world: Path, tmp_
     scan.path.unlink()
     path = scan.dataset.write_labels(scan, tmp_path / "out", loaded, ids)
     assert np.fromfile(path, np.uint32).shape == ids.shape
+
+
+def test_a_bag_in_a_folder_is_labelled_again_if_one_of_its_files_changed(tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    bag.mkdir()
+    recording = Recording("drive")
+    scan = ScanFile("drive/000000", recording, bag, prediction="drive/000000.label")
+    origins = []
+    for content in (b"1", b"22"):
+        (bag / "drive.mcap").write_bytes(content)
+        os.utime(bag, (0, 0))  # the folder says nothing of what is in its files
+        output = OutputOptions(tmp_path / "out")
+        origins.append(Pipeline([scan], lambda *_: [], output)._origins)
+    assert origins[0] != origins[1]
 
 
 def test_the_disk_is_named_that_has_no_space(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import socket
 import time
@@ -28,7 +27,7 @@ from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
-from amvnet.files import temporary_folder
+from amvnet.files import digest, temporary_folder
 from amvnet.fleet.manifest import check_outside, split_name
 from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, results_schema
 from amvnet.fleet.secrets import without_secrets
@@ -82,7 +81,7 @@ class LabelScans:
         self._out = Place.of(out)
         self._worker = f"{socket.gethostname()}:{os.getpid()}"
         digests = "".join(request.settings["weights"].values())
-        self._digest = hashlib.sha256(digests.encode()).hexdigest()[:16]
+        self._digest = digest(digests)
 
     def __call__(self, batch: pa.Table) -> pa.Table:
         """Label the scans of a batch; return their rows in the table of results."""

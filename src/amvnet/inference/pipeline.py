@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
@@ -21,7 +20,7 @@ from amvnet.data.labels.writers import SCORES, SIGNATURES, UNCERTAIN, write_unce
 from amvnet.data.recordings import ScanFile, by_recording
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken, memory_for
-from amvnet.files import alone_in, atomic_write, inside
+from amvnet.files import alone_in, atomic_write, digest, inside, size_and_time
 from amvnet.inference.drive import Broken, Drives, Labelled, Outcome
 from amvnet.inference.journal import UNFINISHED, Entry, Journal, check_unchanged, read_journals
 from amvnet.inference.scan_stream import READ_AHEAD, stream_groups
@@ -32,7 +31,6 @@ from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED_SCANS
 
 UNCERTAIN_ENDING = ".uncertain.npy"
-DIGEST_LENGTH = 16  # the hexadecimal digits of a digest in the journal
 
 
 @dataclass(frozen=True)
@@ -176,14 +174,14 @@ class Pipeline:
     def _origins(self) -> dict[str, str]:
         """The digests for `Entry.origin`, by scan."""
         origins = {}
+        stamps = {path: size_and_time(path) for path in {scan.path for scan in self.scans}}
         for scans in by_recording(self.scans).values():
-            files = [(scan.name, *_size_and_time(scan.path)) for scan in scans]
+            files = [(scan.name, *stamps[scan.path]) for scan in scans]
             for index, scan in enumerate(scans):
                 values: list[Any] = [files[index][1:], files[:MEASURED_SCANS]]
                 if self.drives is not None:  # the labels also depend on the scans in reach
                     values.append(files[self.drives.reach_of(index)])
-                digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()
-                origins[_key(scan)] = digest[:DIGEST_LENGTH]
+                origins[_key(scan)] = digest(json.dumps(values))
         return origins
 
     def stream(
@@ -370,15 +368,6 @@ def _check_folder(scan: ScanFile, output: OutputOptions) -> None:
             f"{scan.path}: expected another folder for the labels, found the scan's own folder; "
             "change --out"
         )
-
-
-def _size_and_time(path: Path) -> tuple[int, int]:
-    """Return a file's size in bytes and time of change in nanoseconds; zeros if it is missing."""
-    try:
-        status = path.stat()
-    except OSError:
-        return 0, 0
-    return status.st_size, status.st_mtime_ns
 
 
 def _key(scan: ScanFile) -> str:
