@@ -351,6 +351,14 @@ def test_inputs_of_different_classes_are_refused(tmp_path: Path) -> None:
     fails(lambda: list_inputs([kitti, str(scan)]), "the same classes")
 
 
+def test_a_scan_that_was_read_and_moved_has_the_points_that_it_was_moved_to(tmp_path: Path) -> None:
+    street(0)[0].tofile(tmp_path / "a.bin")
+    scan = amvnet.read(tmp_path / "a.bin")
+    moved = replace(scan, points=scan.points[::2] + np.array([1, 0, 0, 0], np.float32), ring=None)
+    result = amvnet.load(weights_for())(moved)
+    np.testing.assert_array_equal(result.points, moved.points[:, :3])
+
+
 def test_a_scan_that_is_read_again_is_the_file_as_it_is_then(tmp_path: Path) -> None:
     """A scan that was kept since its sensor was measured is kept no longer than that."""
     path = write(tmp_path, "a", "os1-64", 1.7)

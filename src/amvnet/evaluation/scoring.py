@@ -53,7 +53,7 @@ class MethodLabels(NamedTuple):
     turned: np.ndarray | None = None
 
 
-Labelled = tuple[ScanFile, Scan, MethodLabels]  # a scan with its labels by several methods
+ByMethods = tuple[ScanFile, Scan, MethodLabels]  # a scan with its labels by several methods
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def evaluate(
         return record, scan, labels
 
     share = processes.share(records)
-    labelled: Iterator[Labelled] = stream_labelled(
+    labelled: Iterator[ByMethods] = stream_labelled(
         dataset, share, label, labeller.at_once, progress
     )
     if drives is not None:
@@ -138,7 +138,7 @@ def evaluate(
     return sum(processes.gather(evaluation), Evaluation(taxonomy))
 
 
-def _with_consensus(labelled: Iterator[Labelled], drives: Drives) -> Iterator[Labelled]:
+def _with_consensus(labelled: Iterator[ByMethods], drives: Drives) -> Iterator[ByMethods]:
     """Add the labels by `DRIVE` to the labels of scans, which are in the order of their drives."""
     for _, drive in groupby(labelled, key=lambda item: item[0].recording):
         for (record, scan, labels), scores, _ in drives.consensus().stream(
@@ -148,7 +148,7 @@ def _with_consensus(labelled: Iterator[Labelled], drives: Drives) -> Iterator[La
             yield record, scan, labels._replace(ids={**labels.ids, DRIVE: ids})
 
 
-def _drive_scan(item: Labelled, drives: Drives) -> DriveScan[Labelled]:
+def _drive_scan(item: ByMethods, drives: Drives) -> DriveScan[ByMethods]:
     record, scan, labels = item
     assert labels.turned is not None
     pose = drives.poses[record]

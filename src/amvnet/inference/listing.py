@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -181,7 +181,8 @@ class Scans(Sequence[Scan]):
     def __getitem__(self, index: int | slice) -> Scan | Scans:
         if isinstance(index, slice):
             return Scans(self.path, self._scans[index])
-        return self._scans[index].load(labels=True)
+        # Whoever gets the scan may move its points, so that they are no longer those of the file.
+        return replace(self._scans[index].load(labels=True), file_xyz=None)
 
     def __repr__(self) -> str:
         return f"<Scans of {self.path}: {len(self)}>"
