@@ -205,6 +205,19 @@ def test_a_scan_that_changed_is_labelled_again_with_all_scans_in_its_reach(
     assert 1 < len(changed) <= REACH + 1 + REACH
 
 
+def test_a_drive_with_a_broken_scan_resumes_to_the_same_labels(world: Path, tmp_path: Path) -> None:
+    write_drive(tmp_path / "data")
+    broken = tmp_path / "data/sequences/00/velodyne/000010.bin"
+    broken.write_bytes(broken.read_bytes()[:-3])
+    out = tmp_path / "out"
+    command = f"predict {tmp_path}/data --weights {world}/w.safetensors --drive --out {out}"
+    assert run_cli(*command.split())[0] == 3
+    whole = labels_in(out)
+    (out / "sequences/00/predictions/000014.label").unlink()
+    assert run_cli(*command.split(), "--resume")[0] == 3
+    assert labels_in(out) == whole
+
+
 @pytest.mark.full
 def test_a_run_is_not_resumed_with_other_poses_or_past_scans_alone(
     world: Path, tmp_path: Path
