@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 import amvnet
 from amvnet.cli.main import main
 from amvnet.config.schema import RangeViewConfig
+from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
@@ -36,14 +37,15 @@ from amvnet.sensors.lidars import (
     rotation_from_degrees,
 )
 from amvnet.sensors.measure import MEASURED_SCANS, raise_points
-from amvnet.sensors.normalise import Normaliser, _row_view
+from amvnet.sensors.normalise import Normaliser, _row_view, normalised
 from amvnet.weights.file import built_in, load, save
 from lidarstreets import LIDAR_MODELS
 
 from fixtures.commands import fails, files, refusal, run_cli
+from fixtures.datasets import make_nuscenes
 from fixtures.examples import first_of, with_examples
 from fixtures.scan_writers import pcd_bytes, write_bag1
-from fixtures.sensors import LASERS, ground_height, place
+from fixtures.sensors import LASERS, ground_height, on_nuscenes_car, place
 from fixtures.tiny import fresh_weights, make_streets, trained_for
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
@@ -611,6 +613,36 @@ def test_scans_of_datasets_are_not_normalised(tmp_path: Path) -> None:
     np.testing.assert_array_equal(labels, SEMANTICKITTI.to_raw(expected))
     assert labels[3] == 0
     assert np.delete(expected, 3).all()
+
+
+@pytest.mark.parametrize(("sensor", "is_changed"), [("hdl64e", True), ("hdl32e", False)])
+def test_scans_of_a_benchmark_are_normalised_for_weights_that_do_not_know_its_sensor(
+    tmp_path: Path, sensor: str, is_changed: bool
+) -> None:
+    layout = make_nuscenes(tmp_path)
+    points, laser = on_nuscenes_car()
+    np.column_stack([points * [1, 1, 1, 255], laser]).astype(np.float32).tofile(layout.first_points)
+    layout.first_labels.write_bytes(np.ones(len(points), np.uint8).tobytes())
+    dataset = open_dataset(layout.spec)
+    expected = Expectation.of_sensor(sensor)
+    changed = normalised(dataset, Normaliser(expected))
+
+    scans = dataset.records(layout.sequences)
+    (record,) = [
+        scan for scan in changed.records(layout.sequences) if scan.path == layout.first_points
+    ]
+    own = next(scan for scan in scans if scan.path == layout.first_points).load(labels=True)
+    scan = record.load(labels=True)
+    np.testing.assert_array_equal(scan.labels, own.labels)
+    assert (scan.own is None) or not scan.own.any()
+    assert (scan.row is not None) == is_changed
+    assert scan.valid.all()
+    if is_changed:
+        cloud = Cloud(own.points[:, :3], own.points[:, 3], own.ring, name=own.name)
+        alone = Normaliser(expected, Sensor(unit="m", keep_own=True))(cloud, "alone")
+        np.testing.assert_array_equal(scan.points, alone.points)
+    else:
+        np.testing.assert_array_equal(scan.points, own.points)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -225,6 +225,26 @@ def test_a_scan_of_mixed_lasers_has_bands_of_elevation_of_both(random_scan: Rand
     assert counts == {3, 4, 5, 6}
 
 
+@pytest.mark.parametrize("has_own", [(True, True), (True, False), (False, True)])
+def test_points_of_the_car_itself_stay_known_in_joined_scans(
+    has_own: tuple[bool, bool], random_scan: RandomScan
+) -> None:
+    def with_own(seed: int, is_known: bool) -> Scan:
+        scan = random_scan(200, seed)
+        own = np.random.default_rng(seed).random(200) < 0.2
+        return replace(scan, own=own if is_known else None, file_xyz=scan.points[:, :3])
+
+    scan, other = with_own(1, has_own[0]), with_own(2, has_own[1])
+    own = set()
+    for each in (scan, other):
+        own |= {tuple(point) for point in each.points[~each.valid].tolist()}
+    for join in (mix, mix_lasers):
+        joined = join(scan, other, np.random.default_rng(0))
+        found = {tuple(point) for point in joined.points[~joined.valid].tolist()}
+        assert found == own & set(index_by_point(joined))
+        assert joined.file_xyz is None
+
+
 def test_scans_without_a_common_band_are_not_mixed_to_nothing() -> None:
     high = Scan(np.array([[1, 0, 9, 0.5]], np.float32))
     low = Scan(np.array([[1, 0, -9, 0.5]], np.float32))

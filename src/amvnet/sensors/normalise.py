@@ -22,7 +22,14 @@ from amvnet.sensors.frame import MAX_SENSOR_HEIGHT, Frame
 from amvnet.sensors.intensity import IntensityMap, fill_intensity, intensity_map
 from amvnet.sensors.laser_order import lasers_by_order
 from amvnet.sensors.lasers import SensorGeometry, describe_lasers, elevations, rows_by_density
-from amvnet.sensors.lidars import ANY, UNITS, Sensor, make_sensor, rotation_from_degrees
+from amvnet.sensors.lidars import (
+    ANY,
+    KNOWN_SENSORS,
+    UNITS,
+    Sensor,
+    make_sensor,
+    rotation_from_degrees,
+)
 from amvnet.sensors.measure import (
     MEASURED_SCANS,
     Estimate,
@@ -269,8 +276,8 @@ def normalised(
 ) -> Dataset:
     """Return a dataset whose scans are normalised as scan files are.
 
-    Only a user's own scans are changed: the scans of the benchmarks stay unchanged, because weights
-    are trained on such scans.
+    The scans of a benchmark stay unchanged if the weights know its sensor, because weights are
+    trained on such scans. Otherwise, all their points are labelled, also those of the car itself.
 
     Args:
         normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML
@@ -280,7 +287,12 @@ def normalised(
     Raises:
         InputError: if the YAML file describes an impossible sensor.
     """
-    if dataset.described_sensor is not None and not normaliser.sensor.is_known:
+    if dataset.benchmark_sensor:
+        lasers = SensorGeometry().override(KNOWN_SENSORS[dataset.benchmark_sensor])
+        if normaliser.expected is None or normaliser.expected.lasers.is_like(lasers):
+            return dataset
+        normaliser = normaliser.for_sensor(Sensor(unit="m", keep_own=True))
+    elif dataset.described_sensor is not None and not normaliser.sensor.is_known:
         normaliser = normaliser.for_sensor(described_sensor(dataset))
 
     normaliser.recall(measured)

@@ -268,6 +268,8 @@ def _join(scan: Scan, other: Scan) -> Scan:
         ring=_join_indices(scan.ring, other.ring, scan, other),
         row=_join_indices(scan.row, other.row, scan, other),
         source=_join_indices(scan.source, other.source, scan, other),
+        own=_join_indices(scan.own, other.own, scan, other, missing=False),
+        file_xyz=None,
     )
 
 
@@ -278,13 +280,17 @@ def _join_labels(scan: Scan, other: Scan) -> np.ndarray | None:
 
 
 def _join_indices(
-    first: np.ndarray | None, second: np.ndarray | None, scan: Scan, other: Scan
+    first: np.ndarray | None,
+    second: np.ndarray | None,
+    scan: Scan,
+    other: Scan,
+    missing: int = -1,
 ) -> np.ndarray | None:
-    """Return the rings, rows or sources of both scans. Points of a scan without them get -1."""
+    """Return the rings, rows, ... of both scans. Points of a scan without them get `missing`."""
     if first is None and second is None:
         return None
     if first is None:
-        first = np.full(len(scan), -1)
+        first = np.full(len(scan), missing)
     if second is None:
-        second = np.full(len(other), -1)
+        second = np.full(len(other), missing)
     return np.concatenate([first, second])

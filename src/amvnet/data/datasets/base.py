@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -40,6 +41,8 @@ class Dataset(ABC):
         simulated_sensor: the sensor whose scans are simulated, new ones in each epoch; "" if the
             scans are recorded.
         described_sensor: what a description of the dataset says of the sensor, if anything.
+        benchmark_sensor: the name of the sensor of a benchmark. Its scans stay unchanged for
+            weights that know this sensor, because weights are trained on such scans.
         ids_advice: what a user can do about an unknown id in labels; None is advice on files.
         normalise: makes scans of the points in the files; without it, points stay unchanged.
         finish: takes each scan that `ScanFile.load` reads, and returns it as labels need it.
@@ -48,6 +51,7 @@ class Dataset(ABC):
     readers = 8
     simulated_sensor = ""
     described_sensor: str | Mapping[str, Any] | None = None
+    benchmark_sensor = ""
     ids_advice: str | None = None
     normalise: Normalise | None = None
     finish: Callable[[Scan], Scan] | None = None
@@ -117,15 +121,19 @@ class Dataset(ABC):
         """
 
     def recordings(self) -> list[Recording]:
-        """Return the recordings that `normalise` can change.
-
-        Scans of the benchmarks stay unchanged, because weights are trained on such scans.
-        """
+        """Return the recordings whose sensors are measured; a benchmark has none."""
         return []
 
     def normalised_by(self, normalise: Normalise) -> Dataset:
-        """Return the dataset with its `recordings` normalised."""
+        """Return the dataset with its scans normalised, if they can be."""
         return self
+
+    def _normalised(self, scan: Scan) -> Scan:
+        """Return a labelled scan as `normalise` makes it, whose sensor is measured on it alone."""
+        if self.normalise is None:
+            return scan
+        cloud = Cloud(scan.points[:, :3], scan.points[:, 3], scan.ring, name=scan.name)
+        return dataclasses.replace(self.normalise(cloud, scan.name), labels=scan.labels)
 
     def at_epoch(self, record: ScanFile, epoch: int) -> ScanFile:
         """Return the scan that takes a scan's place in an epoch: in most datasets, the scan."""

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, not_trained_on
+from amvnet.data.datasets.base import Dataset, Normalise, not_trained_on
 from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
@@ -67,6 +69,7 @@ class NuScenes(Dataset):
             not given, or a table is missing or broken.
     """
 
+    benchmark_sensor = "hdl32e"
     ids_advice = "use the tables that came with the labels"
 
     def __init__(self, root: Path | str, version: str | None = None) -> None:
@@ -158,7 +161,18 @@ class NuScenes(Dataset):
             )
 
         ids = self.labels(record, len(points)) if labels else None
-        return Scan(points, labels=ids, ring=ring, name=record.name)
+        return self._normalised(Scan(points, labels=ids, ring=ring, name=record.name))
+
+    def normalised_by(self, normalise: Normalise) -> NuScenes:
+        """Return the same scans, normalised."""
+        changed = copy.copy(self)
+        changed.normalise = normalise
+        changed._recordings = {}
+        for scene, recording in self._recordings.items():
+            changed._recordings[scene] = same = Recording(scene)
+            for scan in recording.scans:
+                same.scans.append(replace(scan, recording=same, dataset=changed))
+        return changed
 
     def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Read the (N,) indices in category.json of the points of one scan."""

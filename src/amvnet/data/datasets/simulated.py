@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, Normalise
-from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.labels.ids import write_array
 from amvnet.data.recordings import Recording, ScanFile
@@ -73,7 +72,7 @@ class SimulatedStreets(Dataset):
         self.simulated_sensor = sensor
         self.normalise = normalise
         if sensor not in UNCHANGED:
-            self.described_sensor = {"unit": "m", "axes": "x-forward"}
+            self.described_sensor = {"unit": "m", "axes": "x-forward", "keep_own": True}
 
     def parts(self) -> dict[str, tuple[str, ...]]:
         """Return the streets of "train", "val" and "all"."""
@@ -124,11 +123,10 @@ class SimulatedStreets(Dataset):
     def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan; simulate its street if it is not in the cache."""
         scan = self._read(record, labels)
-        if self.normalise is None:
-            return scan
-        # Without rings: most files have none, and the scans of a street may be of several sensors.
-        cloud = Cloud(scan.points[:, :3], scan.points[:, 3], name=scan.name)
-        return dataclasses.replace(self.normalise(cloud, scan.name), labels=scan.labels)
+        # Without rings, as most files of scans are.
+        if self.normalise is not None:
+            scan = dataclasses.replace(scan, ring=None)
+        return self._normalised(scan)
 
     def _read(self, record: ScanFile, labels: bool) -> Scan:
         """Return a scan as its sensor writes it; raise the errors of `read`."""
