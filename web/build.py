@@ -45,6 +45,7 @@ WITHOUT_RUNTIME = (
 MODELS = (
     {"folder": "sim-hdl64e", "title": "HDL-64E, 19 classes", "sample": "street.bin"},
     {"folder": "sim-hdl32e", "title": "HDL-32E, 16 classes"},
+    {"folder": "sim-any", "title": "any LiDAR, 19 classes"},
 )
 SAMPLE_SEED = 80
 SAMPLE_STREET = 7  # the training has no such street

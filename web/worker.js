@@ -1,7 +1,7 @@
 // Read and segment scans in a worker, so that the page stays responsive.
 //
 // The worker takes {id, file, folders, isPreview}: a scan file, and the folders of weights. The first weights are used
-// that know the lasers of the scan; if none do, the first ones. It sends messages with the same id: {kind: "began",
+// that are made for the lasers of the scan; if none are, the first ones. It sends messages with the same id: {kind: "began",
 // work}, {kind: "step", title, seconds}, {kind: "shown", ...}, {kind: "labelled", ...} and {kind: "failed", text}. A newer
 // request ends the work on an older one after its step.
 
@@ -65,7 +65,7 @@ async function fitting(cloud, folders) {
     try {
       const description = await readDescription(folder);
       const scan = normalise(cloud, { view: description.range_view, ...description.expects });
-      if (scan.isLike ?? !first) return { folder, description, scan };
+      if (scan.isOwn ?? !first) return { folder, description, scan };
       first ??= { folder, description, scan };
     } catch (error) {
       if (!first || !(error instanceof InputError)) throw error;  // the first weights can label the scan

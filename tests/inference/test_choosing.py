@@ -38,16 +38,23 @@ def write(
 # ---- the table
 
 
-@pytest.mark.parametrize(("name", "sensor"), BUILT_IN.items())
-def test_built_in_weights_are_chosen_for_their_own_sensor(name: str, sensor: str) -> None:
-    assert weights_for(SensorGeometry().override(KNOWN_SENSORS[sensor]))[0] == name
+@pytest.mark.parametrize("sensor", KNOWN_SENSORS)
+def test_weights_for_all_kinds_of_lasers_label_what_has_no_weights_of_its_own(sensor: str) -> None:
+    own = {sensor: name for name, sensor in BUILT_IN.items()}
+    name, reason = weights_for(SensorGeometry().override(KNOWN_SENSORS[sensor]))
+    assert name == own.get(sensor, LAST)
+    assert reason.startswith("trained for ")
+    assert ("all kinds" in reason) == (sensor not in own)
 
 
-@pytest.mark.parametrize("lasers", [SensorGeometry(), SensorGeometry(16, 15, -15)])
-def test_other_and_unknown_lasers_choose_the_last_weights_of_the_table(
-    lasers: SensorGeometry,
-) -> None:
-    assert weights_for(lasers)[0] == LAST
+def test_unknown_lasers_choose_the_last_weights_of_the_table() -> None:
+    assert weights_for(SensorGeometry())[0] == LAST
+
+
+def test_classes_without_weights_for_such_lasers_are_not_said_to_know_them() -> None:
+    name, reason = weights_for(SensorGeometry(16, 15, -15), NUSCENES)
+    assert name == "sim-hdl32e"
+    assert reason.startswith("as none with these classes")
 
 
 @pytest.mark.parametrize("classes", [SEMANTICKITTI, NUSCENES])
@@ -55,7 +62,9 @@ def test_other_and_unknown_lasers_choose_the_last_weights_of_the_table(
 def test_the_classes_of_a_benchmark_go_before_the_lasers(sensor: str, classes: Taxonomy) -> None:
     name, _ = weights_for(SensorGeometry().override(KNOWN_SENSORS[sensor]), classes)
     assert amvnet.weights.load(name).taxonomy.classes == classes.classes
-    assert weights_for(lasers_of(classes), classes)[0] == name
+    chosen, _ = weights_for(lasers_of(classes), classes)
+    assert BUILT_IN[chosen] in ("hdl64e", "hdl32e")
+    assert amvnet.weights.load(chosen).taxonomy.classes == classes.classes
 
 
 # ---- inputs
@@ -75,7 +84,7 @@ def test_the_lasers_of_the_first_recording_choose(
 
 def test_a_described_sensor_chooses_whatever_the_points_show(tmp_path: Path) -> None:
     path = str(write(tmp_path / "scan.npy", "vlp16"))
-    for name, sensor in BUILT_IN.items():
+    for sensor, name in (("hdl32e", "sim-hdl32e"), ("hdl64e", "sim-hdl64e"), ("os1-64", LAST)):
         assert find_inputs([path]).choose_weights(make_sensor(sensor))[0] == name
 
 

@@ -364,7 +364,7 @@ def test_a_sensor_that_is_stated_and_contradicts_the_scan_is_named(
 
 
 @pytest.mark.parametrize(
-    ("laser", "advice"), [("hdl32e", "sim-hdl32e would fit"), ("vlp16", "no built-in weights have")]
+    ("laser", "advice"), [("hdl32e", "sim-hdl32e would fit"), ("vlp16", "sim-any would fit")]
 )
 def test_a_warning_about_another_sensor_names_built_in_weights_that_fit(
     laser: str, advice: str

@@ -34,7 +34,7 @@ from amvnet.models.neighbours import nearest_others
 from amvnet.models.views import polar_view
 from amvnet.onnx_runner import distances, image_rows, polar_features, range_image, scores_of_points
 from amvnet.scan import Scan
-from amvnet.sensors import frame, ground, intensity, laser_order, lasers, own_body
+from amvnet.sensors import built_in, frame, ground, intensity, laser_order, lasers, own_body
 from amvnet.sensors import normalise as normalising
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
@@ -54,7 +54,7 @@ PAGE = Path(__file__).parents[2] / "web"
 DRIVER = Path(__file__).parents[1] / "fixtures" / "web_modules.mjs"
 FORMATS = ("kitti.bin", "ascii.pcd", "binary.pcd", "compressed.pcd", "ascii.ply", "little.ply")
 # The page chooses among its own weights, so it names no built-in ones.
-NO_OTHERS = re.compile("; (no built-in weights have|[^;]* would fit)$")
+NO_OTHERS = re.compile("; [^;]* would fit$")
 POLAR = PolarViewConfig(radial=40, angular=36, vertical=8, nearest=6)
 NEIGHBOURS = 15
 K = 3  # number of classes whose scores are made up
@@ -758,6 +758,7 @@ NUMBERS: dict[str, dict[str, float]] = {
         "LEAST_OWN": own_body.LEAST_OWN,
         "QUICK_STEP": frame.QUICK_STEP,
         "SAME_BEAMS": lasers.SAME_BEAMS,
+        "OWN_ANGLE": built_in.OWN_ANGLE,
     },
     "sensor/rows.js": {
         "OUTSIDE": normalising.MAX_OUTSIDE_SHARE,

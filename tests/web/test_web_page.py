@@ -250,7 +250,7 @@ WEIGHTS = {
     "sample": "sim-hdl64e",
     "kitti": "sim-hdl64e",
     "nuscenes": "sim-hdl32e",
-    "pcd": "sim-hdl64e",
+    "pcd": "sim-any",
 }
 
 

@@ -15,11 +15,12 @@ const QUICK_STEP = 7;  // the step between the points that show the lasers of su
 // The body of nuScenes' car in the frame of its files, metres, and the field of view of its sensor.
 const BODY = { low: [-0.71, -1.18, -0.93], high: [0.71, 2.07, 0.01], sensor: { beams: 32, fov_up: 10.67, fov_down: -30.67 } };
 const SAME_BEAMS = 1.4;  // the largest ratio of two numbers of lasers that are alike
+const OWN_ANGLE = 3;  // the largest difference of the ends of the field of view of weights' own sensor, degrees
 
 /**
- * Return {points, rows, places, text, isLike}. The valid points are normalised (4 n: x, y, z in metres, intensity in
+ * Return {points, rows, places, text, isOwn}. The valid points are normalised (4 n: x, y, z in metres, intensity in
  * [0, 1]). With them come their rows in the range image, or null, their places in the cloud, a line on what was assumed,
- * and whether the weights have seen such lasers, or null if they do not say which they have seen.
+ * and whether the weights are made for such lasers, or null if they do not say for which.
  *
  * `expected` describes the scans that the weights know: {view, sensor, intensity, as_is}.
  */
@@ -41,7 +42,8 @@ export function normalise(cloud, expected) {
   const texts = [map.text, missingText(cloud), negativeText(cloud), ...frameTexts(frame)];
   texts.push(heightText(frame, sensor.height), fault, lasersText(lasers));
   const isLike = isLikeOf(lasers, sensor), text = `assumed ${texts.filter(Boolean).join(", ")}`;
-  return { count, ...kept, text: isLike === false ? text + strangeText(sensor) : text, isLike };
+  const isOwn = isLikeOf(lasers, sensor, OWN_ANGLE);
+  return { count, ...kept, text: isLike === false ? text + strangeText(sensor) : text, isOwn };
 }
 
 /** Return the points (4 n, float32) at finite coordinates that are not the origin, and their places in the cloud. */
@@ -137,11 +139,11 @@ function lasersText({ beams, fov_up: top, fov_down: bottom }) {
 }
 
 /** Return whether lasers are like those of a sensor; null if its field of view is not known. */
-function isLikeOf(lasers, sensor) {
+function isLikeOf(lasers, sensor, angle) {
   if (sensor.name === ANY) return true;
   if (sensor.fov_up === null || sensor.fov_down === null) return null;
   const ratio = lasers.beams && sensor.beams ? lasers.beams / sensor.beams : 1;
-  return ratio > 1 / SAME_BEAMS && ratio < SAME_BEAMS && hasEndsOf(lasers, sensor);
+  return ratio > 1 / SAME_BEAMS && ratio < SAME_BEAMS && hasEndsOf(lasers, sensor, angle);
 }
 
 /** Return the end of the line that says which sensor the weights have seen instead. */

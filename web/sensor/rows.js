@@ -231,6 +231,6 @@ function endsOf({ fov_up: top, fov_down: bottom }) {
 }
 
 /** Return whether two fields of view are alike; ends that are not known count as alike. */
-export function hasEndsOf(a, b) {
-  return ["fov_up", "fov_down"].every((end) => a[end] === null || b[end] === null || Math.abs(a[end] - b[end]) <= SAME_ANGLE);
+export function hasEndsOf(a, b, angle = SAME_ANGLE) {
+  return ["fov_up", "fov_down"].every((end) => a[end] === null || b[end] === null || Math.abs(a[end] - b[end]) <= angle);
 }

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR, SEMANTICKITTI, Taxonomy
 from amvnet.sensors.lasers import SensorGeometry, describe_lasers
-from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, Sensor
+from amvnet.sensors.lidars import ANY, BUILT_IN, KNOWN_SENSORS, Sensor
+
+OWN_ANGLE = 3.0  # largest difference of an end of the field of view of weights' own sensor, degrees
 
 
 def weights_for(
@@ -23,15 +25,16 @@ def weights_for(
         why = "scans are of several sensors" if is_mixed else "lasers are unknown"
         return names[-1], f"as the {why}"
     fitting = [name for name in _fitting(lasers) if name in names]
-    if fitting:
-        return fitting[0], f"trained for such lasers ({describe_lasers(lasers)})"
-    return names[-1], f"as none were trained for such lasers ({describe_lasers(lasers)})"
+    found = describe_lasers(lasers)
+    if not fitting:
+        return names[-1], f"as none with these classes were trained for such lasers ({found})"
+    kind = "all kinds of lasers" if BUILT_IN[fitting[0]] == ANY else "such lasers"
+    return fitting[0], f"trained for {kind} ({found})"
 
 
 def suited_to(lasers: SensorGeometry) -> str:
-    """Return in words which built-in weights have seen such lasers."""
-    names = _fitting(lasers)
-    return f"{' and '.join(names)} would fit" if names else "no built-in weights have"
+    """Return the name of the built-in weights that suit such lasers best."""
+    return _fitting(lasers)[0]
 
 
 def lasers_of(classes: Taxonomy) -> SensorGeometry:
@@ -43,8 +46,8 @@ def lasers_of(classes: Taxonomy) -> SensorGeometry:
 
 
 def _fitting(lasers: SensorGeometry) -> list[str]:
-    """Return the names of the built-in weights that have seen such lasers."""
-    return [name for name in BUILT_IN if lasers.is_like(_trained_lasers(name))]
+    """Return the names of the built-in weights that have seen such lasers, the best first."""
+    return [name for name in BUILT_IN if lasers.is_like(_trained_lasers(name), OWN_ANGLE)]
 
 
 def _trained_lasers(name: str) -> SensorGeometry:

@@ -64,17 +64,22 @@ class SensorGeometry:
 
         return cls(**medians)
 
-    def has_ends_of(self, other: SensorGeometry) -> bool:
-        """Return whether the fields of view are alike. An unknown end is like any other."""
-        return _is_near(self.fov_up, other.fov_up) and _is_near(self.fov_down, other.fov_down)
+    def has_ends_of(self, other: SensorGeometry, angle: float = SAME_ANGLE) -> bool:
+        """Return whether the fields of view are alike. An unknown end is like any other.
 
-    def is_like(self, other: SensorGeometry) -> bool:
-        """Return whether the lasers are alike. An unknown value is like any other."""
+        Args:
+            angle: the largest difference of an end, degrees.
+        """
+        ends = ((self.fov_up, other.fov_up), (self.fov_down, other.fov_down))
+        return all(one is None or two is None or abs(one - two) <= angle for one, two in ends)
+
+    def is_like(self, other: SensorGeometry, angle: float = SAME_ANGLE) -> bool:
+        """Return whether the lasers are alike, with the ends as for `has_ends_of`."""
         if self.beams and other.beams:
             ratio = self.beams / other.beams
             if not 1 / SAME_BEAMS < ratio < SAME_BEAMS:
                 return False
-        return self.has_ends_of(other)
+        return self.has_ends_of(other, angle)
 
     def known(self) -> dict[str, Any]:
         """Return the known values by name."""
@@ -84,11 +89,6 @@ class SensorGeometry:
         """Return the geometry with its values replaced by the known values of a sensor."""
         stated = SensorGeometry(**{key: getattr(sensor, key) for key in MEASURES})
         return dataclasses.replace(self, **stated.known())
-
-
-def _is_near(angle: float | None, other: float | None) -> bool:
-    """Return whether two angles in degrees are alike, or one of them is unknown."""
-    return angle is None or other is None or abs(angle - other) <= SAME_ANGLE
 
 
 def describe_lasers(lasers: SensorGeometry) -> str:

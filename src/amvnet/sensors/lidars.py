@@ -26,7 +26,7 @@ KNOWN_BODIES = {"hdl32e": (-0.71, -1.18, -0.93, 0.71, 2.07, 0.01)}
 
 # The sensors that the built-in weights are trained for, by the name of the weights. The last
 # weights also label the scans of any other sensor.
-BUILT_IN = {"sim-hdl32e": "hdl32e", "sim-hdl64e": "hdl64e"}
+BUILT_IN = {"sim-hdl32e": "hdl32e", "sim-hdl64e": "hdl64e", "sim-any": ANY}
 AUTO = "auto"  # stands for the name of the built-in weights that suit the lasers
 
 # Rotations that turn a file's x, y, z into forward, left, up, by the name of the file's axes.

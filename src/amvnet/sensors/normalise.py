@@ -103,7 +103,7 @@ def describe(
     name = trained.name or "a sensor"
     return (
         f"{line}; the weights were trained for {name} ({describe_lasers(expected.lasers)}) "
-        f"and have seen no such sensor; {suited_to(lasers)}"
+        f"and have seen no such sensor; {suited_to(lasers)} would fit"
     )
 
 
