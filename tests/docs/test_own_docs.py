@@ -92,7 +92,7 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
-    succeed("predict cloud.pcd --weights sim-hdl64e --method bev --out labels --overwrite")
+    succeed("predict cloud.pcd --method bev --out labels --overwrite")
     lines = capsys.readouterr().out.splitlines()
     (printed,) = [line for line in lines if line.startswith("cloud.pcd")]
     (documented,) = re.findall(r"    (cloud\.pcd: .*)\n    (.*)\n", SCANS.text)

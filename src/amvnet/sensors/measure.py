@@ -137,16 +137,16 @@ class Measured:
     def _measure(self, cloud: Cloud) -> Estimate:
         with errors_of(cloud.name):
             frame = find_frame(cloud.xyz[cloud.is_placed], self._sensor)
-        return self._measure_in(frame, cloud)
+        return self._measure_in(frame, cloud, density=True)
 
-    def _measure_in(self, frame: Frame, cloud: Cloud) -> Estimate:
-        """Measure the lasers and the intensities of a scan whose frame is known."""
+    def _measure_in(self, frame: Frame, cloud: Cloud, density: bool = False) -> Estimate:
+        """Measure the lasers, if asked their density, and the intensities in a known frame."""
         seen, _ = seen_scan(cloud, frame, self._sensor, self._usual_height)
         valid = seen.valid
         points = seen.points[valid]
         lasers = measure_lasers(points, None if seen.ring is None else seen.ring[valid])
-        density = laser_density(points)
-        return Estimate(frame, lasers, quantiles_of(cloud.measured_intensity()), density)
+        quantiles = quantiles_of(cloud.measured_intensity())
+        return Estimate(frame, lasers, quantiles, laser_density(points) if density else None)
 
     def _recognises(self, cloud: Cloud, usual: Estimate) -> bool:
         """Return whether a scan in the usual frame is from the usual sensor.
