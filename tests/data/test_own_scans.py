@@ -141,6 +141,7 @@ def test_splits_are_folders_patterns_or_lists_and_may_cut_through_a_folder(tmp_p
     assert data.sequences("val") == ("b-val",)
     assert [record.name for record in data.records(["b-val"])] == ["b/0", "b/1"]
     assert data.sequences("all") == ("a", "b-train", "b-val", "c")
+    assert data.records(["b"]) == data.records(["b-train", "b-val"])
 
     both = describe(tmp_path, split={"train": "a", "val": "a/0"})
     fails(lambda: open_own(both), "a/0", "train and val")

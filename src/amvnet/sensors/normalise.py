@@ -276,8 +276,9 @@ def normalised(
 ) -> Dataset:
     """Return a dataset whose scans are normalised as scan files are.
 
-    The scans of a benchmark stay unchanged if the weights know its sensor, because weights are
-    trained on such scans. Otherwise, all their points are labelled, also those of the car itself.
+    The scans of benchmarks stay unchanged, because weights are trained on such scans, unless the
+    weights do not know the benchmark's sensor (`Dataset.benchmark_sensor`). Then all their points
+    are labelled, also those of the car itself.
 
     Args:
         normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML

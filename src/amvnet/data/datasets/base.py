@@ -41,8 +41,9 @@ class Dataset(ABC):
         simulated_sensor: the sensor whose scans are simulated, new ones in each epoch; "" if the
             scans are recorded.
         described_sensor: what a description of the dataset says of the sensor, if anything.
-        benchmark_sensor: the name of the sensor of a benchmark. Its scans stay unchanged for
-            weights that know this sensor, because weights are trained on such scans.
+        benchmark_sensor: the name of the sensor of a benchmark, whose scans are normalised for
+            weights that do not know it; "" if all scans stay unchanged: other sensors' scans often
+            have the layout of SemanticKITTI, and so have those that weights are trained on.
         ids_advice: what a user can do about an unknown id in labels; None is advice on files.
         normalise: makes scans of the points in the files; without it, points stay unchanged.
         finish: takes each scan that `ScanFile.load` reads, and returns it as labels need it.

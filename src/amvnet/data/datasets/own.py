@@ -77,16 +77,21 @@ class OwnScans(Dataset):
         )
 
     def records(self, sequences: Sequence[str]) -> list[ScanFile]:
-        """Return the scans of these sequences, in order."""
+        """Return the scans of these sequences, in order; a folder's name stands for its parts."""
         present = self.parts()["all"]
+        folders = {self._folder_of(name) for name in self._scans}
         for name in sequences:
-            if name not in present:
+            if name not in present and name not in folders:
                 raise InputError(
                     f"{self.spec}: expected a sequence of {', '.join(present[:20])}, "
                     f"found {name!r}; name one of them"
                 )
 
-        chosen = [record for record, _ in self._listing if record.sequence in sequences]
+        chosen = [
+            record
+            for record, _ in self._listing
+            if record.sequence in sequences or self._folder_of(record.name) in sequences
+        ]
         # The scans of a recording stay in order, even if the split cuts it into sequences.
         return sorted(chosen, key=lambda record: (self._folder_of(record.name), record.name))
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, Normalise, not_trained_on
+from amvnet.data.datasets.base import Dataset, not_trained_on
 from amvnet.data.formats.cloud import check_usable
 from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import check_bits, read_ids
@@ -27,8 +26,6 @@ class SemanticKitti(Dataset):
     Raises:
         InputError: if `root` does not have this layout.
     """
-
-    benchmark_sensor = "hdl64e"
 
     def __init__(self, root: Path | str) -> None:
         super().__init__(root, SEMANTICKITTI)
@@ -82,13 +79,7 @@ class SemanticKitti(Dataset):
         path = record.path
         points = check_usable(read_table(path, np.float32, KITTI_COLUMNS), path)
         ids = self.labels(record, len(points)) if labels else None
-        return self._normalised(Scan(points, labels=ids, name=record.name))
-
-    def normalised_by(self, normalise: Normalise) -> SemanticKitti:
-        """Return the same scans, normalised."""
-        changed = copy.copy(self)
-        changed.normalise = normalise
-        return changed
+        return Scan(points, labels=ids, name=record.name)
 
     def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Read the (N,) raw ids of one scan."""
