@@ -627,22 +627,24 @@ def test_scans_of_a_benchmark_are_normalised_for_weights_that_do_not_know_its_se
     expected = Expectation.of_sensor(sensor)
     changed = normalised(dataset, Normaliser(expected))
 
-    scans = dataset.records(layout.sequences)
-    (record,) = [
-        scan for scan in changed.records(layout.sequences) if scan.path == layout.first_points
-    ]
-    own = next(scan for scan in scans if scan.path == layout.first_points).load(labels=True)
-    scan = record.load(labels=True)
-    np.testing.assert_array_equal(scan.labels, own.labels)
-    assert (scan.own is None) or not scan.own.any()
+    unchanged, scan = (
+        {scan.path: scan for scan in each.records(layout.sequences)}[layout.first_points].load(True)
+        for each in (dataset, changed)
+    )
+    assert unchanged.labels is not None
+    np.testing.assert_array_equal(scan.labels, np.where(scan.valid, unchanged.labels, 0))
     assert (scan.row is not None) == is_changed
-    assert scan.valid.all()
     if is_changed:
-        cloud = Cloud(own.points[:, :3], own.points[:, 3], own.ring, name=own.name)
-        alone = Normaliser(expected, Sensor(unit="m", keep_own=True))(cloud, "alone")
+        cloud = Cloud(
+            unchanged.points[:, :3], unchanged.points[:, 3], unchanged.ring, name=scan.name
+        )
+        alone = Normaliser(expected, Sensor(unit="m"))(cloud, "alone")
         np.testing.assert_array_equal(scan.points, alone.points)
+        np.testing.assert_array_equal(scan.valid, alone.valid)
+        assert 0.1 < 1 - scan.valid.mean() < 0.4  # of the car itself
     else:
-        np.testing.assert_array_equal(scan.points, own.points)
+        np.testing.assert_array_equal(scan.points, unchanged.points)
+        assert scan.valid.all()
 
 
 @pytest.mark.parametrize("seed", range(4))

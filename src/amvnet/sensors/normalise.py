@@ -277,8 +277,7 @@ def normalised(
     """Return a dataset whose scans are normalised as scan files are.
 
     The scans of benchmarks stay unchanged, because weights are trained on such scans, unless the
-    weights do not know the benchmark's sensor (`Dataset.benchmark_sensor`). Then all their points
-    are labelled, also those of the car itself.
+    weights do not know the benchmark's sensor (`Dataset.benchmark_sensor`).
 
     Args:
         normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML
@@ -292,7 +291,7 @@ def normalised(
         lasers = SensorGeometry().override(KNOWN_SENSORS[dataset.benchmark_sensor])
         if normaliser.expected is None or normaliser.expected.lasers.is_like(lasers):
             return dataset
-        normaliser = normaliser.for_sensor(Sensor(unit="m", keep_own=True))
+        normaliser = normaliser.for_sensor(Sensor(unit="m"))
     elif dataset.described_sensor is not None and not normaliser.sensor.is_known:
         normaliser = normaliser.for_sensor(described_sensor(dataset))
 

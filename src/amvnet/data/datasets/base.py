@@ -130,11 +130,18 @@ class Dataset(ABC):
         return self
 
     def _normalised(self, scan: Scan) -> Scan:
-        """Return a labelled scan as `normalise` makes it, whose sensor is measured on it alone."""
+        """Return a labelled scan as `normalise` makes it, whose sensor is measured on it alone.
+
+        Points of the car itself, which get no label, are not scored either.
+        """
         if self.normalise is None:
             return scan
         cloud = Cloud(scan.points[:, :3], scan.points[:, 3], scan.ring, name=scan.name)
-        return dataclasses.replace(self.normalise(cloud, scan.name), labels=scan.labels)
+        normalised = self.normalise(cloud, scan.name)
+        labels = scan.labels
+        if labels is not None and normalised.own is not None:
+            labels = np.where(normalised.own, 0, labels).astype(labels.dtype)
+        return dataclasses.replace(normalised, labels=labels)
 
     def at_epoch(self, record: ScanFile, epoch: int) -> ScanFile:
         """Return the scan that takes a scan's place in an epoch: in most datasets, the scan."""
