@@ -125,9 +125,9 @@ def test_the_file_of_read_only_data_comes_into_the_current_folder(
 ) -> None:
     folder = make_flat(tmp_path / "shared/data", 3, "{:04d}.pcd", "{:04d}.npy")
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != folder.parent)
-    (tmp_path / "work").mkdir()
-    monkeypatch.chdir(tmp_path / "work")
-    refused(f"check {folder}", f"{tmp_path}/work/data.yaml is now the beginning")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    refused(f"check {folder}", f"{tmp_path}/here/data.yaml is now the beginning")
     assert not Path(f"{folder}.yaml").exists()
     succeed("check data.yaml")
     before = Path("data.yaml").read_bytes()
