@@ -37,7 +37,8 @@ from amvnet.sensors.lidars import (
     rotation_from_degrees,
 )
 from amvnet.sensors.measure import MEASURED_SCANS, raise_points
-from amvnet.sensors.normalise import Normaliser, _row_view, normalised
+from amvnet.sensors.normalise import Normaliser, normalised
+from amvnet.sensors.rows import _row_view
 from amvnet.weights.file import built_in, load, save
 from lidarstreets import LIDAR_MODELS
 

@@ -35,7 +35,7 @@ from amvnet.models.views import polar_view
 from amvnet.onnx_runner import distances, image_rows, polar_features, range_image, scores_of_points
 from amvnet.scan import Scan
 from amvnet.sensors import built_in, frame, ground, intensity, laser_order, lasers, own_body
-from amvnet.sensors import normalise as normalising
+from amvnet.sensors import rows as sensor_rows
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.laser_order import lasers_by_order
@@ -761,7 +761,7 @@ NUMBERS: dict[str, dict[str, float]] = {
         "OWN_ANGLE": built_in.OWN_ANGLE,
     },
     "sensor/rows.js": {
-        "OUTSIDE": normalising.MAX_OUTSIDE_SHARE,
+        "OUTSIDE": sensor_rows.MAX_OUTSIDE_SHARE,
         "SAME_ANGLE": lasers.SAME_ANGLE,
         "LASERS_SEEN": schema.MIN_LASERS_SEEN,
         "SLOPE_SPREAD": laser_order.SLOPE_SPREAD,
