@@ -20,6 +20,9 @@ from fixtures.tiny import GOLDEN, fresh_weights, make_streets, write_recipe
 
 MIXED = ("bf16-mixed", "16-mixed")
 AUTO = TrainingConfig(precision="auto")
+# Pixels in a row of the range image. The deepest maps then have 4 columns. With 1 or 2, in 16 bits,
+# oneDNN reads beyond the map on processors with AMX, and what it finds there may make the loss NaN.
+WIDTH = 256
 
 
 @pytest.mark.parametrize(
@@ -72,7 +75,11 @@ def test_each_stage_of_each_recipe_trains_and_resumes_in_mixed_precision(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, precision: str
 ) -> None:
     """Each stage is interrupted once, in its second epoch, and so is resumed from a checkpoint."""
-    over = {"training": {"rv": {"epochs": 2}, "bev": {"epochs": 2}, "precision": precision}}
+    over: dict[str, Any] = {
+        "training": {"rv": {"epochs": 2}, "bev": {"epochs": 2}, "precision": precision}
+    }
+    if not load_recipe(recipe).from_init:
+        over["model"] = {"range_view": {"width": WIDTH}}
     words: list[object] = ["train", write_recipe(tmp_path / "recipe.yaml", recipe, **over)]
     words += ["--out", tmp_path / "run", "--data"]
     if load_recipe(recipe).taxonomy == "semantickitti":
@@ -82,7 +89,8 @@ def test_each_stage_of_each_recipe_trains_and_resumes_in_mixed_precision(
         words += ["--val-sequences", "scene-0916"]
     if load_recipe(recipe).from_init:
         start = fresh_weights()
-        view = replace(start.model.range_view, hidden=0.5)  # as the built-in weights have it
+        # The built-in weights show hidden points as well.
+        view = replace(start.model.range_view, width=WIDTH, hidden=0.5)
         start = replace(start, model=replace(start.model, range_view=view))
         save(start, tmp_path / "start.safetensors")
         words += ["--init", tmp_path / "start.safetensors"]
@@ -100,7 +108,7 @@ def test_each_stage_of_each_recipe_trains_and_resumes_in_mixed_precision(
     monkeypatch.setattr(KeepWeights, "on_train_epoch_end", stop_once)
     for _ in stages:
         with pytest.raises(RuntimeError, match="power"):
-            run_cli(*words, "--resume")
+            assert run_cli(*words, "--resume") == (0, "")
     assert run_cli(*words, "--resume") == (0, "")
     assert interrupted == list(stages)
 
