@@ -34,6 +34,8 @@ from fixtures.drives import HEIGHT, SCANS, drive_poses, drive_scans, write_drive
 from fixtures.tiny import fresh_weights
 
 POSES = drive_poses()
+JUMPING = POSES.copy()
+JUMPING[2:, 0, 3] += 5000
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +107,7 @@ def test_lost_returns_of_a_drive_get_no_label_and_move_no_pose(world: Path) -> N
         (np.eye(3), ["(4, 4)", "shape (3,)"]),
         ("poses.txt", ["(4, 4)", "'p'"]),
         (Path("poses.txt"), ["(4, 4)", "poses.txt"]),
+        (JUMPING, ["m between the scans 1 and 2"]),
     ],
 )
 def test_too_few_or_impossible_poses_are_one_line(

@@ -20,6 +20,7 @@ import torch
 
 import amvnet
 from amvnet.cli.options import load_segmenter
+from amvnet.data.datasets.files import ScanFiles
 from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.engines.torch import TorchEngine
@@ -29,6 +30,7 @@ from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_j
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
+from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
@@ -682,7 +684,13 @@ def test_a_bag_in_a_folder_is_labelled_again_if_one_of_its_files_changed(tmp_pat
     bag = tmp_path / "drive"
     bag.mkdir()
     recording = Recording("drive")
-    scan = ScanFile("drive/000000", recording, bag, prediction="drive/000000.label")
+    scan = ScanFile(
+        "drive/000000",
+        recording,
+        bag,
+        prediction="drive/000000.label",
+        dataset=ScanFiles([]),
+    )
     origins = []
     for content in (b"1", b"22"):
         (bag / "drive.mcap").write_bytes(content)
@@ -690,6 +698,31 @@ def test_a_bag_in_a_folder_is_labelled_again_if_one_of_its_files_changed(tmp_pat
         output = OutputOptions(tmp_path / "out")
         origins.append(Pipeline([scan], lambda *_: [], output)._origins)
     assert origins[0] != origins[1]
+
+
+def test_scans_are_labelled_again_if_a_description_says_something_else_of_how_they_are_read(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "scans").mkdir()
+    for number in range(2):
+        street(number)[0].tofile(tmp_path / f"scans/{number}.bin")
+    output = OutputOptions(tmp_path / "out")
+    request = LabellingRequest(fresh_weights())
+    digests: list[object] = []
+    origins: list[object] = []
+    for says in (
+        "",
+        "sensor: {height: 1.0}",
+        "sensor: {height: 2.0}",
+        "sensor: vlp16",
+        "columns: [x, y, z, intensity]",
+    ):
+        path = tmp_path / "own.yaml"
+        path.write_text(f"scans: scans/*.bin\nclasses: {{road: 1}}\n{says}\n")
+        scans, _ = list_inputs([str(path)])
+        digests.append(request.digest_of(scans, None))
+        origins.append(tuple(Pipeline(scans, lambda *_: [], output)._origins.values()))
+    assert len(set(digests)) == len(set(origins)) == 5
 
 
 def test_the_disk_is_named_that_has_no_space(tmp_path: Path) -> None:

@@ -171,7 +171,8 @@ def drive(
     Args:
         scans: consecutive scans of one recording, as `Segmenter.__call__` takes arrays and `Scan`s.
         poses: the pose (4, 4) of each scan, which moves its points into the world, metres. By
-            default, KISS-ICP estimates them (`pip install "amvnet[drives]"`).
+            default, KISS-ICP estimates them (`pip install "amvnet[drives]"`). A list or an array is
+            checked for jumps; poses that are still to come cannot be.
         past_only: whether only scans before a scan count, as on a robot.
 
     Yields:
@@ -180,8 +181,11 @@ def drive(
 
     Raises:
         InputError: if a scan cannot be segmented, a pose is no rigid motion, there are fewer poses
-            than scans, or kiss-icp is missing.
+            than scans, the poses jump, or kiss-icp is missing.
     """
+    if isinstance(poses, Sequence | np.ndarray) and len(poses) > 1:
+        poses = [as_pose(pose, "poses") for pose in poses]
+        check_steps(np.array(poses), list(map(str, range(len(poses)))), "poses", OTHER_POSES)
 
     def segmented() -> Iterator[DriveScan[Segmentation]]:
         given = None if poses is None else iter(poses if isinstance(poses, Iterable) else [poses])

@@ -164,8 +164,8 @@ class Pipeline:
     def _is_done(self, scan: ScanFile, entry: Entry) -> bool:
         """Return whether the files of a scan of an earlier run exist and are still right.
 
-        The scan has not changed, nor have the first scans of its recording, which decide how it is
-        normalised.
+        The scan has not changed, nor have the first scans of its recording and what a description
+        says of them, which decide how it is normalised.
         """
         paths = [self.output.folder / path for path in self.output.files_of(scan)]
         return entry.origin == self._origins[entry.scan] and all(map(Path.is_file, paths))
@@ -179,6 +179,8 @@ class Pipeline:
             files = [(scan.name, *stamps[scan.path]) for scan in scans]
             for index, scan in enumerate(scans):
                 values: list[Any] = [files[index][1:], files[:MEASURED_SCANS]]
+                if scan.dataset.reading:
+                    values.append(scan.dataset.reading)
                 if self.drives is not None:  # the labels also depend on the scans in reach
                     values.append(files[self.drives.reach_of(index)])
                 origins[_key(scan)] = digest(json.dumps(values))

@@ -104,7 +104,10 @@ class LabellingRequest:
     def digest_of(self, scans: Sequence[ScanFile], drives: Drives | None) -> str:
         """Return a digest of all that the scores of some scans depend on, and of their poses."""
         stamps = {path: size_and_time(path) for path in {scan.path for scan in scans}}
-        files = [(scan.recording.name, scan.name, stamps[scan.path]) for scan in scans]
+        files = [
+            (scan.recording.name, scan.name, scan.dataset.reading, stamps[scan.path])
+            for scan in scans
+        ]
         settings = self.settings | {"engine": self.engine}  # which rounds scores in its own way
         return digest(repr((files, None if drives is None else drives.digest, settings)))
 

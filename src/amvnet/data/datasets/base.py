@@ -41,6 +41,7 @@ class Dataset(ABC):
         simulated_sensor: the sensor whose scans are simulated, new ones in each epoch; "" if the
             scans are recorded.
         described_sensor: what a description of the dataset says of the sensor, if anything.
+        reading: all that a description says of how scans are read, in a text; labels depend on it.
         benchmark_sensor: the name of the sensor of a benchmark, whose scans are normalised for
             weights that do not know it; "" if all scans stay unchanged: other sensors' scans often
             have the layout of SemanticKITTI, and so have those that weights are trained on.
@@ -52,6 +53,7 @@ class Dataset(ABC):
     readers = 8
     simulated_sensor = ""
     described_sensor: str | Mapping[str, Any] | None = None
+    reading = ""
     benchmark_sensor = ""
     ids_advice: str | None = None
     normalise: Normalise | None = None

@@ -44,6 +44,7 @@ class OwnScans(Dataset):
         super().__init__(description.root, description.taxonomy, str(description.path))
         self.description = description
         self.described_sensor = description.sensor
+        self.reading = f"{description.sensor}, {description.layout}"
         self.normalise = normalise
         if scans is not None:
             self._scans = scans
