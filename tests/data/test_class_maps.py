@@ -153,7 +153,7 @@ def test_two_classes_of_one_name_are_refused(tmp_path: Path) -> None:
     fails(lambda: class_map(str(path)), path, "the key 'ground' twice")
 
 
-@pytest.mark.parametrize("name", ["no", "on", "1", "1.5", "null", "2026-01-01"])
+@pytest.mark.parametrize("name", ["no", "on", "1", "1.5", "null"])
 def test_a_name_that_yaml_reads_as_another_value_needs_quotes(tmp_path: Path, name: str) -> None:
     path = tmp_path / "few.yaml"
     path.write_text(f"classes: {{{name}: [road]}}")

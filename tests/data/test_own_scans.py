@@ -321,11 +321,25 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
     np.testing.assert_array_equal(data.read_prediction(record, tmp_path / "out"), EXPECTED)
 
 
-@pytest.mark.parametrize("number", ["1:30", "1:30.5"])
-def test_numbers_that_yaml_takes_for_minutes_are_refused(site: Path, number: str) -> None:
-    path = describe(site.parent)
-    path.write_text(path.read_text() + f"sensor: {{height: {number}}}\n")
-    fails(lambda: open_own(path), path.name, number, "without :")
+@pytest.mark.parametrize("number", ["1:30", "1:30.5", "01", "1_0"])
+def test_what_yaml_alone_takes_for_a_number_is_refused_as_a_number(site: Path, number: str) -> None:
+    np.save(site / "a.npy", some_points())
+    path = describe(site.parent, classes=None)
+    text = path.read_text()
+    path.write_text(f"{text}classes: {{ground: {number}}}\n")
+    fails(lambda: open_own(path), path.name, "whole numbers", repr(number))
+
+
+@pytest.mark.parametrize("name", ["07", "010", "2011_09_26", "2024-05-01", "12:30", "7"])
+def test_folders_may_be_named_as_numbers_and_dates(tmp_path: Path, name: str) -> None:
+    """YAML 1.1 reads 010 as 8 and 2011_09_26 as 20110926."""
+    for folder in (name, "b"):
+        (tmp_path / folder).mkdir()
+        np.save(tmp_path / folder / "a.npy", some_points())
+    path = describe(tmp_path)
+    text = path.read_text()
+    path.write_text(f"{text}split: {{train: [{name}], val: b}}\n")
+    assert open_own(path).sequences("train") == (name,)
 
 
 @pytest.mark.parametrize(

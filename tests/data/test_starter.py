@@ -62,6 +62,8 @@ def test_the_beginning_of_a_description_has_all_scans_labels_and_ids(tmp_path: P
         ("{:04d}.npy", "{:04d}_class.npy"),
         ("points/{:04d}.npy", "labels/{:04d}.npy"),
         ("a/b/{:04d}.pcd", "a/truth/label_{:04d}.npy"),
+        ("run[1]/{:04d}.PCD", "run[1]/{:04d}.npy"),
+        ("run?/{:04d}.Pcd", "truth/{:04d}.npy"),
     ],
 )
 def test_scans_and_labels_are_told_apart_whatever_their_names(

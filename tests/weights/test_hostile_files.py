@@ -239,7 +239,8 @@ YAML_TEXTS = {
     + "model: *a29\n",
     "long": "a: " + "x" * 10_000_000,
     "python": "model: !!python/object/apply:os.system ['true']\n",
-    "no date": "model: 2001-99-99\n",
+    "no date": "model: !!timestamp 2001-99-99\n",
+    "digits": f"model: {'9' * 10_000}\n",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import re
@@ -13,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.description import ENDINGS, LabelPlace
+from amvnet.data.datasets.description import ENDINGS, REST, LabelPlace
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.detect import named_ending, scan_stem
+from amvnet.data.formats.detect import scan_stem
 from amvnet.data.formats.find import list_scans
 from amvnet.data.labels.readers import COLUMNS, read_raw_labels
 from amvnet.data.spacing import evenly_spaced
@@ -26,13 +27,14 @@ from amvnet.progress import counted
 
 COUNTED_FILES = 20  # number of label files whose ids are counted
 MOST_CLASSES = 50  # largest number of ids that become classes
-UNLABELLED = (0, INSTANCE_MASK)  # ids that usually stand for no label; the second one is -1
-REST = "rest"
-TRIED_FILES = 3  # number of files of a kind, one of which must be a scan
+# Ids that usually stand for no label, as the YAML file writes them.
+UNLABELLED: Mapping[int, int | str] = {0: 0, INSTANCE_MASK: -1}
+TRIED_FILES = 3  # a group has scans if one of so many first files can be read as a scan
 
-SUFFIX = re.compile(r"[_.-][A-Za-z]+$")  # the end of a stem that tells labels from scans
+SUFFIX = re.compile(r"[_.-][A-Za-z]+$")  # the last word of a stem, as in 0001_label
 
-Group = tuple[str, str, str]  # files with an ending, in folders of a name, and with a SUFFIX
+# What files of one kind have in common: their ending, the name of their folder, and the SUFFIX.
+Group = tuple[str, str, str]
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Found:
     Attributes:
         scans: the files of the scans, sorted.
         pattern: a pattern that matches them, relative to the folder.
-        first: the first scan.
+        first: the points of the first scan that could be read.
         labels: the place of the labels; None if there are none.
         labelled: the number of scans with labels.
         ids: the number of points by raw id in some of the labels, most first.
@@ -76,10 +78,7 @@ class Found:
         """Return the YAML file, which lies beside the folder `root`."""
         total = sum(self.ids.values())
         classes = [raw for raw in self.ids if raw not in UNLABELLED][:MOST_CLASSES]
-        ignored: list[int | str] = []
-        for raw in self.ids:
-            if raw not in classes:
-                ignored.append({INSTANCE_MASK: -1, 0: 0}.get(raw, REST))
+        ignored = [UNLABELLED.get(raw, REST) for raw in self.ids if raw not in classes]
         lines = [
             "# Give each class a name; one class may have several ids, as [1, 2].",
             "# docs/own_data.md explains all keys.",
@@ -133,43 +132,62 @@ def find_labelled(folder: Path) -> Found:
     Raises:
         InputError: if there is no scan.
     """
-    groups: dict[Group, list[Path]] = defaultdict(list)
-    for path in sorted(folder.rglob("*")):
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        if path.is_file() and not hidden:
-            suffix = SUFFIX.search(scan_stem(path))
-            ending = named_ending(path) or path.suffix
-            groups[ending, path.parent.name, suffix[0] if suffix else ""].append(path)
+    groups = _groups_in(folder)
+    readable = {}
+    for group, paths in groups.items():
+        first_scan = _first_scan(paths)
+        if first_scan is not None:
+            readable[group] = first_scan
 
-    first = {group: found for group, paths in groups.items() if (found := _first_scan(paths))}
     places: dict[Group, LabelPlace] = {}
-    of_labels = set()
-    for group, (scan, cloud) in first.items():
-        for other, paths in groups.items():
-            place = None if other == group else _place_among(paths, scan, len(cloud.xyz))
+    label_groups = set()  # an array of labels can also be readable as points
+    for group, (scan, cloud) in readable.items():
+        for other, candidates in groups.items():
+            if other == group:
+                continue
+            place = _place_among(candidates, scan, len(cloud.xyz))
             if place is not None:
                 places[group] = place
-                of_labels.add(other)  # even if they can be read as points
+                label_groups.add(other)
         inside = _place_inside(scan, len(cloud.xyz))
         if inside is not None:
             places.setdefault(group, inside)
 
-    scans = [group for group in first if group not in of_labels]
-    if not scans:
+    scan_groups = [group for group in readable if group not in label_groups]
+    if not scan_groups:
         raise InputError(f"{folder}: expected scans, found none that can be read; name others")
-    best = max(scans, key=lambda group: (group in places, len(groups[group])))
-    paths = sorted(path for group in scans if group[0] == best[0] for path in groups[group])
-    pattern = _pattern_of([path.relative_to(folder) for path in paths], best[0])
+    best = max(scan_groups, key=lambda group: (group in places, len(groups[group])))
+    # Scans of one ending belong together, even if their folders have different names.
+    ending = best[0]
+    paths = sorted(path for group in scan_groups if group[0] == ending for path in groups[group])
+    pattern = _pattern_of([path.relative_to(folder) for path in paths], ending)
+    first = readable[best][1]
     place = places.get(best)
     if place is None:
-        return Found(paths, pattern, first[best][1])
+        return Found(paths, pattern, first)
 
     labelled = [path for path in paths if place.path_of(path, scan_stem(path)).is_file()]
-    return Found(paths, pattern, first[best][1], place, len(labelled), _ids_of(labelled, place))
+    return Found(paths, pattern, first, place, len(labelled), _ids_of(labelled, place))
+
+
+def _groups_in(folder: Path) -> Mapping[Group, Sequence[Path]]:
+    """Return the files in a folder and below it by their groups, without hidden ones, sorted."""
+    groups: dict[Group, list[Path]] = defaultdict(list)
+    for path in sorted(folder.rglob("*")):
+        is_hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if path.is_file() and not is_hidden:
+            stem = scan_stem(path)
+            suffix = SUFFIX.search(stem)
+            ending = path.name[len(stem) :]
+            groups[ending, path.parent.name, suffix[0] if suffix else ""].append(path)
+    return groups
 
 
 def _first_scan(paths: Sequence[Path]) -> tuple[Path, Cloud] | None:
-    """Return the first file that can be read as a scan, if one of the first ones can."""
+    """Return the first file that can be read as a scan, and its points.
+
+    Return None if none of the first `TRIED_FILES` can be read.
+    """
     for path in paths[:TRIED_FILES]:
         with suppress(InputError):
             return path, next(iter(list_scans(path))).read()
@@ -177,20 +195,24 @@ def _first_scan(paths: Sequence[Path]) -> tuple[Path, Cloud] | None:
 
 
 def _place_among(paths: Sequence[Path], scan: Path, count: int) -> LabelPlace | None:
-    """Return the place of the labels if one of some files has a label for each point of a scan."""
+    """Return the place of the labels of a scan with `count` points, if they are among some files.
+
+    Only the nearest file that has the scan's name in its own counts.
+    """
     stem = scan_stem(scan)
     named = [path for path in paths if stem in path.name]
-    for path in sorted(named, key=lambda path: len(os.path.relpath(path, scan.parent))):
-        with suppress(InputError):
-            read_raw_labels(path, count, missing=0)
-            folder = Path(os.path.relpath(path.parent, scan.parent))
-            return LabelPlace((folder / path.name.replace(stem, "{name}", 1)).as_posix())
-        break
+    if not named:
+        return None
+    nearest = min(named, key=lambda path: len(os.path.relpath(path, scan.parent)))
+    with suppress(InputError):
+        read_raw_labels(nearest, count, missing=0)
+        folder = Path(os.path.relpath(nearest.parent, scan.parent))
+        return LabelPlace((folder / nearest.name.replace(stem, "{name}", 1)).as_posix())
     return None
 
 
 def _place_inside(scan: Path, count: int) -> LabelPlace | None:
-    """Return the place of the labels if a column of the scan's file holds them."""
+    """Return the place of the labels of a scan if a column of its own file holds them."""
     for column in COLUMNS:
         with suppress(InputError):
             read_raw_labels(scan, count, column, missing=0)
@@ -213,17 +235,20 @@ def _ids_of(scans: Sequence[Path], place: LabelPlace) -> dict[int, int]:
 
 
 def _pattern_of(paths: Sequence[Path], ending: str) -> str:
-    """Return a pattern that matches files with an ending in the folders of some paths."""
+    """Return a pattern that matches all files with an ending in the folders of some paths.
+
+    It has `*` where names of folders differ, and `**` if folders are at different depths.
+    """
     depths = {len(path.parts) for path in paths}
     if len(depths) > 1:
         return f"**/*{ending}"
     levels = zip(*(path.parent.parts for path in paths), strict=True)
-    folders = [names[0] if len(set(names)) == 1 else "*" for names in levels]
+    folders = [glob.escape(names[0]) if len(set(names)) == 1 else "*" for names in levels]
     return "/".join([*folders, f"*{ending}"])
 
 
 def _entry(place: LabelPlace) -> str | dict[str, str]:
-    """Return the place of labels as the value of `labels`."""
+    """Return the place of labels as the key `labels` of a description holds it."""
     return {"field": place.field} if place.field is not None else place.file or ""
 
 
