@@ -30,12 +30,17 @@ from amvnet.progress import Reporter
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")  # the second one is an older name
 POSE_TYPES = (
-    *(ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped"),
-    *("geometry_msgs/msg/PoseWithCovarianceStamped", *TF_TYPES),
+    ODOMETRY_TYPE,
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    *TF_TYPES,
 )
-LONGEST_CHAIN = 100  # largest number of frames above each other that count
-# The kinds of poses; the first one is the end of the names of topics whose transforms are fixed.
-STATIC, TF, GIVEN = "tf_static", "tf", "given"
+LONGEST_CHAIN = 100  # largest number of frames from the scans' frame to the highest one
+
+# Where a transform comes from, which tells whether it may change.
+STATIC = "tf_static"  # from a topic whose name ends so, which holds what never changes
+TF = "tf"  # from any other topic of tf
+GIVEN = "given"  # from a topic of odometry or of poses
 
 
 @dataclass(frozen=True)
@@ -51,14 +56,18 @@ class BagPoses:
     scan_topic: str | None
 
     def times(self) -> list[float]:
-        """Return the time stamps of the scans in seconds; raise InputError if one is broken."""
+        """Return the time stamps of the scans in seconds.
+
+        Raises:
+            InputError: if the header of a scan is broken.
+        """
         times: list[float] = self._call(read_times, self.scan_topic)["times"].tolist()
         return times
 
     def odometry(self) -> str | None:
         """Return the first topic with odometry, or None if there is none."""
-        topics = [name for name, kind in self._topics().items() if kind == ODOMETRY_TYPE]
-        return min(topics, default=None)
+        types = self._types()
+        return min((topic for topic in types if types[topic] == ODOMETRY_TYPE), default=None)
 
     def at_scans(self, topic: str, report: Reporter) -> Poses:
         """Return the pose (N, 4, 4) of the LiDAR in each scan.
@@ -72,10 +81,10 @@ class BagPoses:
             InputError: if there is no such topic, its poses do not include the times of the scans
                 or are no rigid motions, or no chain of frames leads to the scans' frame.
         """
-        topics = self._topics()
-        if topic not in topics:
-            listed = sorted(topics.items())[:LISTED_TOPICS]
-            listing = ", ".join(f"{name} ({kind})" for name, kind in listed)
+        types = self._types()
+        if topic not in types:
+            listed = sorted(types.items())[:LISTED_TOPICS]
+            listing = ", ".join(f"{other} ({msgtype})" for other, msgtype in listed)
             raise InputError(
                 f"{self.path}: expected the topic {topic} with poses, or a file of this name, "
                 f"found {listing or 'no topic with poses'}; give another topic or file, or leave "
@@ -83,15 +92,16 @@ class BagPoses:
             )
 
         name = f"{self.path} ({topic})"
-        found = self._call(read_transforms, self.scan_topic, topic)
-        transforms = _transforms(name, found)
-        if topics[topic] in TF_TYPES:
-            return _by_tf(name, transforms, found["frame"], found["times"])
-        return _by_odometry(name, transforms, found["frame"], found["times"], report)
+        content = self._call(read_transforms, self.scan_topic, topic)
+        transforms = _transforms(name, content)
+        if types[topic] in TF_TYPES:
+            return _by_tf(name, transforms, content["frame"], content["times"])
+        return _by_odometry(name, transforms, content["frame"], content["times"], report)
 
-    def _topics(self) -> dict[str, str]:
-        topics: dict[str, str] = self._call(pose_topics)["topics"]
-        return topics
+    def _types(self) -> dict[str, str]:
+        """Return the types of the topics with poses, by the topics' names."""
+        types: dict[str, str] = self._call(pose_topics)["types"]
+        return types
 
     def _call(self, function: Any, *arguments: Any) -> dict[str, Any]:
         with readable(self.path):
@@ -100,48 +110,52 @@ class BagPoses:
 
 @dataclass(frozen=True)
 class _Transform:
-    """The poses of a frame in its parent, as rows (M, 8) of time x y z qx qy qz qw.
+    """The poses of a frame in its parent.
 
-    `kind` is STATIC or TF for transforms, or GIVEN for the poses of a topic.
+    Attributes:
+        name: what messages call it.
+        child: the frame; empty for a topic of poses, which does not name it.
+        source: STATIC, TF or GIVEN.
+        rows: (M, 8) time x y z qx qy qz qw, seconds and metres, in the order of the bag.
     """
 
     name: str
     parent: str
     child: str
-    kind: str
+    source: str
     rows: NDArray[np.float64]
 
     @property
     def is_fixed(self) -> bool:
-        """Whether it does not change: by its topic, or because /tf has it at a single time."""
-        return self.kind == STATIC or (self.kind == TF and not np.ptp(self.rows[:, 0]))
+        """Whether it never changes: by its topic, or because /tf has it at a single time."""
+        return self.source == STATIC or (self.source == TF and not np.ptp(self.rows[:, 0]))
 
-    def fixed(self) -> _Transform:
-        """Return it as one that does not change if it is a transform that is always the same.
+    def fixed_if_constant(self) -> _Transform:
+        """Return it as a fixed one if /tf repeats the same values, else unchanged.
 
         Drivers also send transforms within the robot on /tf, again and again.
         """
-        is_constant = self.kind != GIVEN and not np.ptp(self.rows[:, 1:], axis=0).any()
-        return replace(self, kind=STATIC) if is_constant else self
+        is_constant = self.source == TF and not np.ptp(self.rows[:, 1:], axis=0).any()
+        return replace(self, source=STATIC) if is_constant else self
 
     def at(self, times: NDArray[np.float64]) -> Poses:
         """Return the pose at each time (N, 4, 4), or the only one (1, 4, 4) if it is fixed."""
         if self.is_fixed:
             return timed_poses(self.name, self.rows[-1:]).poses
-        # Messages can be late or come twice.
+        # Messages can be late or come twice, but times must ascend.
         _, first = np.unique(self.rows[:, 0], return_index=True)
         return timed_poses(self.name, self.rows[first]).interpolate(times)
 
 
-def _transforms(name: str, found: Mapping[str, Any]) -> list[_Transform]:
-    """Return the transforms that `read_transforms` found, with the rows of each."""
-    order = np.argsort(found["edges"], kind="stable")
-    ends = np.cumsum(np.bincount(found["edges"], minlength=len(found["frames"])))
+def _transforms(name: str, content: Mapping[str, Any]) -> list[_Transform]:
+    """Return the transforms that `read_transforms` found; messages begin with `name`."""
+    order = np.argsort(content["edge_of_row"], kind="stable")
+    ends = np.cumsum(np.bincount(content["edge_of_row"]))
+    rows_of_edges = np.split(content["rows"][order], ends)  # and no rows after the last end
     transforms = []
-    rows_of_each = np.split(found["rows"][order], ends[:-1])
-    for (parent, child, kind), rows in zip(found["frames"], rows_of_each, strict=False):
+    for (parent, child, source), rows in zip(content["edges"], rows_of_edges[:-1], strict=True):
         label = f"{name}, {shown(child)} in {shown(parent)}"
-        transforms.append(_Transform(label, parent, child, kind, rows))
+        transforms.append(_Transform(label, parent, child, source, rows))
     return transforms
 
 
@@ -149,11 +163,11 @@ def _by_tf(
     name: str, transforms: Sequence[_Transform], frame: str, times: NDArray[np.float64]
 ) -> Poses:
     """Return the poses (N, 4, 4) of a frame in the highest frame above it."""
-    # If none moves, the robot may have stood still.
-    for some in (list(map(_Transform.fixed, transforms)), transforms):
-        chain = _climb(frame, some, times)
+    # If all that moves is constant, the robot may have stood still: then its poses are these.
+    for candidates in (list(map(_Transform.fixed_if_constant, transforms)), transforms):
+        chain = _climb(frame, candidates, times)
         poses = list(chain.values())[-1]
-        if len(poses) == len(times):
+        if len(poses) == len(times):  # a chain of fixed transforms has one pose for all times
             return poses
     raise InputError(
         f"{name}: expected moving frames above the scans' frame {shown(frame)}, found the "
@@ -170,24 +184,27 @@ def _by_odometry(
     report: Reporter,
 ) -> Poses:
     """Return the poses (N, 4, 4) of a frame that is fixed to the frame with odometry."""
-    fixed = [item for item in map(_Transform.fixed, transforms) if item.is_fixed]
-    moving = [item for item in transforms if item.kind == GIVEN]
-    if len(moving) != 1:
-        pairs = ", ".join(f"{shown(item.child)} in {shown(item.parent)}" for item in moving[:3])
+    fixed = [item for item in map(_Transform.fixed_if_constant, transforms) if item.is_fixed]
+    given = [item for item in transforms if item.source == GIVEN]
+    if len(given) != 1:
+        pairs = ", ".join(f"{shown(item.child)} in {shown(item.parent)}" for item in given[:3])
         raise InputError(
             f"{name}: expected the poses of one frame, found {pairs or 'no message'}; choose "
             "another topic, or leave --poses out, so that the poses are estimated"
         )
 
-    (odometry,) = moving
+    (odometry,) = given
     poses = odometry.at(times)
     of_lidar = _climb(frame, fixed, times)
     of_child = _climb(odometry.child, fixed, times)
     common = next((above for above in of_lidar if above in of_child), None)
     if common is None:
+        reason = f"no fixed transform leads from {shown(odometry.child)} to"
+        if not odometry.child:
+            reason = "they do not name their frame, such as"
         report(
-            f"{name}: assumed that its poses are the LiDAR's: no fixed transform leads from "
-            f"{shown(odometry.child)} to the scans' frame {shown(frame)}"
+            f"{name}: assumed that its poses are the LiDAR's: {reason} the scans' frame "
+            f"{shown(frame)}"
         )
         return poses
     moved: Poses = poses @ np.linalg.inv(of_child[common]) @ of_lidar[common]
@@ -197,12 +214,16 @@ def _by_odometry(
 def _climb(
     frame: str, transforms: Sequence[_Transform], times: NDArray[np.float64]
 ) -> dict[str, Poses]:
-    """Return the poses of a frame in itself and in all frames above it, by their names, upwards."""
+    """Return the poses of a frame in itself and in each frame above it, by their names, upwards.
+
+    Poses are (N, 4, 4), or (1, 4, 4) as long as only fixed transforms lead to a frame.
+    """
+    # Of several transforms of a frame, the last one counts: one that moves, if there is any.
     above = {item.child: item for item in sorted(transforms, key=lambda item: not item.is_fixed)}
     poses: dict[str, Poses] = {frame: np.eye(4)[None]}
     while frame in above and len(poses) < LONGEST_CHAIN:
         transform = above[frame]
-        if transform.parent in poses:  # the frames are a circle
+        if transform.parent in poses:  # broken bags have frames in a circle
             break
         poses[transform.parent] = transform.at(times) @ poses[frame]
         frame = transform.parent
@@ -218,39 +239,44 @@ def read_times(path: Path, ending: str, scan_topic: str | None) -> dict[str, Any
 
 
 def pose_topics(path: Path, ending: str) -> dict[str, dict[str, str]]:
-    """Return the types of the topics with poses, by name."""
-    with reading(path, EXPECTED, ADVICE), closing(open_reader(path, ending)) as reader:
-        return {"topics": {item.topic: item.msgtype for item in _with_poses(reader.connections)}}
+    """Return the types of the topics with poses, by the topics' names."""
+    with reading(path, EXPECTED, ADVICE), closing(open_reader(path, ending)) as bag:
+        return {"types": {each.topic: each.msgtype for each in _with_poses(bag.connections)}}
 
 
 def read_transforms(path: Path, ending: str, scan_topic: str | None, topic: str) -> dict[str, Any]:
-    """Return the scans' times (N,) and frame, and all poses of a topic and transforms beside them.
+    """Return the poses of a topic, and transforms that may lead from it to the scans' frame.
 
-    Beside tf, these are the static ones; beside a topic of poses, all. Each of the `rows` (M, 8) of
-    time x y z qx qy qz qw belongs to one of the `edges` (M,), indices into the `frames`: parent,
-    child, and its kind.
+    A topic of tf comes with the static transforms, a topic of poses with all transforms.
+
+    Returns:
+        `times`: (N,) the time stamps of the scans, seconds.
+        `frame`: the frame of the scans.
+        `edges`: the parent, the child and the source (STATIC, TF or GIVEN) of each transform.
+        `rows`: (M, 8) time x y z qx qy qz qw of all messages, seconds and metres.
+        `edge_of_row`: (M,) the index of the transform that a row belongs to.
     """
     times, frame = Bag(path, ending, scan_topic).headers()
     deserialise = deserialiser(ending == ".bag")
-    frames: dict[tuple[str, str, str], int] = {}
-    edges = array("q")
+    edges: dict[tuple[str, str, str], int] = {}
+    edge_of_row = array("q")
     rows = array("d")
     with reading(f"{path} ({topic})", EXPECTED, ADVICE), closing(open_reader(path, ending)) as bag:
         connections = _with_poses(bag.connections)
-        kinds = {each.topic: _kind_of(each) for each in connections}
-        beside = (STATIC, TF) if kinds[topic] == GIVEN else (STATIC,)
-        chosen = [each for each in connections if each.topic == topic or _kind_of(each) in beside]
+        sources = {each.topic: _source_of(each) for each in connections}
+        wanted = (STATIC, TF) if sources[topic] == GIVEN else (STATIC,)
+        chosen = [each for each in connections if each.topic == topic or _source_of(each) in wanted]
         for connection, _, data in bag.messages(connections=chosen):
-            kind = TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
-            for parent, child, *row in _poses_of(deserialise(data, kind)):
-                key = (parent.strip("/"), child.strip("/"), kinds[connection.topic])
-                edges.append(frames.setdefault(key, len(frames)))
+            msgtype = TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
+            for parent, child, *row in _poses_of(deserialise(data, msgtype)):
+                edge = (parent.strip("/"), child.strip("/"), sources[connection.topic])
+                edge_of_row.append(edges.setdefault(edge, len(edges)))
                 rows.extend(row)
     return {
         "times": times,
         "frame": frame.strip("/"),
-        "frames": list(frames),
-        "edges": np.array(edges),
+        "edges": list(edges),
+        "edge_of_row": np.array(edge_of_row),
         "rows": np.array(rows).reshape(-1, 8),
     }
 
@@ -259,7 +285,7 @@ def _with_poses(connections: Iterable[Any]) -> list[Any]:
     return [connection for connection in connections if connection.msgtype in POSE_TYPES]
 
 
-def _kind_of(connection: Any) -> str:
+def _source_of(connection: Any) -> str:
     if connection.msgtype not in TF_TYPES:
         return GIVEN
     return STATIC if connection.topic.endswith(STATIC) else TF
@@ -267,16 +293,16 @@ def _kind_of(connection: Any) -> str:
 
 def _poses_of(message: Any) -> Iterator[tuple[Any, ...]]:
     """Yield the poses of a message: parent, child, time x y z qx qy qz qw."""
-    for one in getattr(message, "transforms", [message]):
-        if hasattr(one, "transform"):
-            place, turn = one.transform.translation, one.transform.rotation
+    for stamped in getattr(message, "transforms", [message]):
+        if hasattr(stamped, "transform"):
+            place, turn = stamped.transform.translation, stamped.transform.rotation
         else:
-            pose = getattr(one.pose, "pose", one.pose)  # in another message with a covariance
+            pose = getattr(stamped.pose, "pose", stamped.pose)  # the outer one has a covariance
             place, turn = pose.position, pose.orientation
-        stamp = one.header.stamp
+        stamp = stamped.header.stamp
         time = stamp.sec + stamp.nanosec * 1e-9
-        child = getattr(one, "child_frame_id", "")
-        yield one.header.frame_id, child, time, *_values(place, "xyz"), *_values(turn, "xyzw")
+        child = getattr(stamped, "child_frame_id", "")
+        yield stamped.header.frame_id, child, time, *_values(place, "xyz"), *_values(turn, "xyzw")
 
 
 def _values(vector: Any, names: str) -> list[float]:
