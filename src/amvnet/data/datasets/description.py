@@ -16,15 +16,16 @@ from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_ta
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
 
 ENDINGS = (".yaml", ".yml")
+ROW_KEYS = ("columns", "dtype")  # say what rows of numbers without names hold
 KEYS = (
     *("name", "root", "classes", "ignored", "scans", "labels", "poses", "split", "sensor"),
-    *("columns", "dtype"),
+    *ROW_KEYS,
 )
 OTHER_NAMES = {"names": "classes"}  # keys of the same meaning in other tools' files
 SPLITS = ("train", "val", "test")
 WILDCARDS = set("*?[")  # characters of patterns
 PLACEHOLDER = re.compile(r"\{\w*\}")
-REST = "rest"  # among the ignored ids: all ids that the file does not name
+REST = "rest"  # an entry of `ignored`: all ids that the file does not name
 
 
 @dataclass(frozen=True)
@@ -63,13 +64,18 @@ class Description:
     """What the YAML file of a dataset says.
 
     Attributes:
-        root: the folder that all other paths are relative to.
-        unread: the classes of the labels, if they are not the classes in `taxonomy`. Such labels
-            are not read.
+        path: the YAML file.
+        root: the folder of the data, absolute; all other paths are relative to it.
+        taxonomy: the classes of predictions, and of labels unless there is `unread`.
+        scans: the pattern of the scan files.
+        labels: where labels are; None if scans have no labels.
         poses: the file of the poses of all scans in a folder, relative to this folder; empty if
             the poses are unknown.
+        unread: the classes of the labels, if they are not the classes in `taxonomy`. Such labels
+            are not read.
         split: names of folders and scans, and patterns, by split; empty if there is no split.
-        sensor: the name or the attributes of the sensor; None if it is to be measured.
+        sensor: the name of the sensor, or its attributes by name (`sensors.lidars.make_sensor`);
+            None if it is to be measured.
         layout: what rows of numbers without names hold.
     """
 
@@ -103,6 +109,7 @@ def read_description(path: Path | str) -> Description:
 
 
 def _parse(path: Path, tree: Any) -> Description:
+    """Return the description that the tree of a YAML file holds; messages name the key only."""
     _check_keys("", tree, KEYS, required=("classes", "scans"))
     root = below(path.parent.absolute(), os.path.expanduser(_text(tree, "root", ".")))
 
@@ -135,42 +142,47 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
     entries = class_entries(tree["classes"], "ids", "road: [1, 2]")
     train_to_raw = []
     raw_to_train: dict[int | str, int] = {}
-    for train_id, (title, values) in enumerate(entries.items(), start=1):
-        _check_keys(f"classes: {title}", values, ("ids", "color"), required=("ids",))
-        ids = _ids(f"classes: {title}", values["ids"], least=0)
+    for train_id, (class_name, values) in enumerate(entries.items(), start=1):
+        title = f"classes: {class_name}"
+        _check_keys(title, values, ("ids", "color"), required=("ids",))
+        ids = _ids(title, values["ids"], smallest=0)
         if not ids:
-            raise InputError(f"classes: {title}: expected ids, found none; name one or more")
+            raise InputError(f"{title}: expected ids, found none; name one or more")
         train_to_raw.append(ids[0])
         for raw_id in ids:
-            _add(raw_to_train, raw_id, train_id)
+            _add_id(raw_to_train, raw_id, train_id)
 
-    entries_ignored = tree.get("ignored", [])
-    if not isinstance(entries_ignored, list):
-        entries_ignored = [entries_ignored]
-    ignored = _ids("ignored", [entry for entry in entries_ignored if entry != REST], least=-1)
-    for raw_id in ignored:
-        _add(raw_to_train, raw_id, 0)
+    ignored = tree.get("ignored", [])
+    if not isinstance(ignored, list):
+        ignored = [ignored]
+    ids = _ids("ignored", [entry for entry in ignored if entry != REST], smallest=-1)
+    for raw_id in ids:
+        _add_id(raw_to_train, raw_id, 0)
 
-    if not ignored:  # predictions need an id for points without a class
-        ignored = [next(raw for raw in range(INSTANCE_MASK) if raw not in raw_to_train)]
-        raw_to_train[ignored[0]] = 0
-    taxonomy = user_taxonomy(name, entries, raw_to_train, (ignored[0], *train_to_raw))
-    return dataclasses.replace(taxonomy, ignores_rest=REST in entries_ignored)
+    if not ids:  # predictions need an id for points without a class: the first that no class has
+        ids = [next(raw_id for raw_id in range(INSTANCE_MASK) if raw_id not in raw_to_train)]
+        raw_to_train[ids[0]] = 0
+    taxonomy = user_taxonomy(name, entries, raw_to_train, (ids[0], *train_to_raw))
+    return dataclasses.replace(taxonomy, ignores_rest=REST in ignored)
 
 
-def _add(raw_to_train: dict[int | str, int], raw_id: int, train_id: int) -> None:
+def _add_id(raw_to_train: dict[int | str, int], raw_id: int, train_id: int) -> None:
+    """Add a raw id to the ids of a class, or raise InputError if it has a class already."""
     if raw_id in raw_to_train:
         raise InputError(f"classes: expected each id once, found {raw_id} twice; correct the ids")
     raw_to_train[raw_id] = train_id
 
 
-def _ids(title: str, values: Any, least: int) -> list[int]:
-    """Return raw ids; an id of -1, which many tools write for no label, becomes the largest id."""
+def _ids(title: str, values: Any, smallest: int) -> list[int]:
+    """Return one or several raw ids as a list; raise InputError if one is no raw id.
+
+    An id of -1, which many tools write for no label, becomes the largest id.
+    """
     ids = []
     for raw_id in values if isinstance(values, list) else [values]:
-        if type(raw_id) is not int or not least <= raw_id <= INSTANCE_MASK:
+        if type(raw_id) is not int or not smallest <= raw_id <= INSTANCE_MASK:
             raise InputError(
-                f"{title}: expected whole numbers from {least} to {INSTANCE_MASK} as ids, "
+                f"{title}: expected whole numbers from {smallest} to {INSTANCE_MASK} as ids, "
                 f"found {shown(raw_id)}; correct them"
             )
         ids.append(raw_id & INSTANCE_MASK)
@@ -179,6 +191,7 @@ def _ids(title: str, values: Any, least: int) -> list[int]:
 
 
 def _parse_labels(entry: Any) -> LabelPlace | None:
+    """Return the place of the labels: a path, an ending such as .label, or a file and a field."""
     if entry is None:
         return None
     if isinstance(entry, str):
@@ -196,16 +209,18 @@ def _parse_labels(entry: Any) -> LabelPlace | None:
             f"labels: expected {{name}} for the scan's name, found {min(others)}; correct it"
         )
     if file is not None and "{name}" not in file:
-        if not file.startswith(".") or "/" in file:  # no ending, such as .label
+        is_ending = file.startswith(".") and "/" not in file
+        if not is_ending:
             raise InputError(
                 f"labels: expected the scan's name in the file, found {file!r}; "
                 "write for example ../labels/{name}.label"
             )
-        file = "{name}" + file  # only an ending
+        file = "{name}" + file
     return LabelPlace(file, None if column is None else str(column))
 
 
 def _parse_split(entry: Any) -> dict[str, tuple[str, ...]]:
+    """Return the names and patterns of each split, without a / at their ends."""
     _check_keys("split", entry, SPLITS)
     splits = {}
     for split, values in entry.items():
@@ -219,7 +234,7 @@ def _parse_split(entry: Any) -> dict[str, tuple[str, ...]]:
 def _check_keys(title: str, tree: Any, keys: Sequence[str], required: Sequence[str] = ()) -> None:
     """Raise InputError if a mapping lacks a key or has an unknown one, or is no mapping.
 
-    `title` is the key of the mapping; it is empty for the whole file.
+    `title` is the key that holds the mapping; it is empty for the whole file.
     """
     prefix = f"{title}: " if title else ""
     if not isinstance(tree, Mapping):
@@ -240,6 +255,7 @@ def _check_keys(title: str, tree: Any, keys: Sequence[str], required: Sequence[s
 
 
 def _text(tree: Mapping[str, Any], key: str, usual: str | None = None) -> str:
+    """Return the text of a key; without a `usual` one, the key is needed."""
     value = tree.get(key, usual)
     if not isinstance(value, str):
         raise InputError(f"{key}: expected a text, found {shown(value)}; correct it")
@@ -247,7 +263,7 @@ def _text(tree: Mapping[str, Any], key: str, usual: str | None = None) -> str:
 
 
 def _texts(title: str, values: Any) -> tuple[str, ...]:
-    """Return one or several texts; a number, such as the sequence 07, counts as a text."""
+    """Return one or several texts; a number, such as the name of the folder 7, is a text, too."""
     entries = values if isinstance(values, list | tuple) else [values]
     for entry in entries:
         if not isinstance(entry, str | int):

@@ -1,7 +1,7 @@
 """Read columns of Feather files (Arrow), such as the scans of Argoverse 2, with pyarrow.
 
 A file may claim to unpack to any amount of memory. Files are therefore read in the process with
-limits.
+limits (`reader_process`).
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ ADVICE = "copy it again, or write the table with pyarrow.feather.write_feather"
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some columns of a table.
+    """Return the wanted columns (N,) of a table, by key.
 
     Raises:
-        InputError: if the file is not Feather, is truncated or lacks a column.
+        InputError: if the file is not Feather, is truncated, lacks a column or has too many rows.
     """
     with reading(path, EXPECTED, ADVICE):
         import pyarrow
@@ -26,11 +26,9 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
         with pyarrow.OSFile(str(path)) as file:
             names = pyarrow.ipc.open_file(file).schema.names
-        chosen = require_columns(names, path, wanted)
+        columns = {key: names[at] for key, at in require_columns(names, path, wanted).items()}
 
-        table = feather.read_table(
-            path, columns=[names[index] for index in chosen.values()], memory_map=False
-        )
+        table = feather.read_table(path, columns=list(columns.values()), memory_map=False)
         table.validate(full=True)
         check_point_count(len(table), path)
-        return {key: table[names[index]].to_numpy() for key, index in chosen.items()}
+        return {key: table[name].to_numpy() for key, name in columns.items()}
