@@ -25,6 +25,7 @@ from rich.table import Table
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.recordings import Recording
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import AXES, KNOWN_HEIGHTS, make_sensor, rotation_from_degrees
@@ -159,7 +160,7 @@ def measure(
         expects = labeller.segmenter.weights.expects
         normaliser = Normaliser(expects, make_sensor(**options), reported.append)
         try:
-            labels = labeller(normaliser(cloud, scan.name))
+            labels = labeller(normaliser(Recording(scan.name)).to_scan(cloud))
         except InputError as error:
             refusal = str(error)
             continue

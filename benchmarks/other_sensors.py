@@ -19,6 +19,7 @@ import numpy as np
 import amvnet
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.recordings import Recording
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.sensors.lidars import make_sensor, simulated_lidar
@@ -57,11 +58,12 @@ def score(dataset: SemanticKitti, segmenter: Segmenter) -> tuple[float, float]:
     """Return AMVNet's mIoU over the classes present and its accuracy, in percent."""
     normalise = Normaliser(segmenter.weights.expects)
     evaluation = Evaluation(dataset.taxonomy)
-    for record in dataset.records(dataset.sequences("all")):
+    recordings = {name: normalise(Recording(name)) for name in dataset.sequences("all")}
+    for record in dataset.records(list(recordings)):
         scan = dataset.read(record)
         assert scan.labels is not None
         cloud = Cloud(scan.points[:, :3], scan.points[:, 3], name=record.name)
-        labels = segmenter(normalise(cloud, record.sequence)).labels
+        labels = segmenter(recordings[record.sequence].to_scan(cloud)).labels
         evaluation.add(scan.points, scan.labels, {"amvnet": labels})
 
     report = evaluation.report(dataset.spec)["methods"]["amvnet"]

@@ -18,6 +18,7 @@ from amvnet.data.formats import find
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
+from amvnet.data.recordings import Recording
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.predict import ADVICE, report_certainty
@@ -105,7 +106,7 @@ def test_a_sensor_in_the_yaml_file_counts_unless_the_command_describes_one(tmp_p
     path = tmp_path / "own.yaml"
     path.write_text('classes: {a: 1, b: 2}\nscans: "scans/*"\nsensor: {height: 1.5}\n')
 
-    for described, expected in ((None, 1.5), (Sensor(height=2.0), 2.0)):
+    for described, expected in ((Sensor(), 1.5), (Sensor(height=2.0), 2.0)):
         dataset = normalise.normalised(
             open_dataset(str(path)), Normaliser(weights_for().expects, described)
         )
@@ -198,7 +199,8 @@ def test_recordings_of_a_run_are_judged_on_the_command_line(
     for name, table in points.items():
         (tmp_path / name).mkdir()
         table.tofile(tmp_path / name / f"{name}.bin")
-        scan = Normaliser(weights.expects)(Cloud(table[:, :3], table[:, 3], name=name), name)
+        cloud = Cloud(table[:, :3], table[:, 3], name=name)
+        scan = Normaliser(weights.expects)(Recording(name)).to_scan(cloud)
         result = amvnet.load(weights)(scan)
         shares[name] = f"{result.uncertain.mean():.1%}"
 
@@ -271,7 +273,8 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
     points = points[laser % 4 == 0]
     np.save(tmp_path / "a.npy", points)
 
-    scan = Normaliser(weights.expects)(Cloud(points[:, :3], points[:, 3], name="a"), "a")
+    cloud = Cloud(points[:, :3], points[:, 3], name="a")
+    scan = Normaliser(weights.expects)(Recording("a")).to_scan(cloud)
     expected = segmenter(scan).labels
     assert np.mean(segmenter(replace(scan, row=None)).labels != expected) > 0.02
 

@@ -315,12 +315,12 @@ def test_a_wrong_parameter_is_one_line_and_exit_code_2(
 
 def test_the_sensor_is_described_as_for_predict(start: Callable[..., Any]) -> None:
     node = start(sensor="vlp16", height=0.9, axes="y-forward", intensity_scale=255.0)
-    sensor = node._segment._normalise.sensor
+    sensor = node._segment._sensor
     assert (sensor.name, sensor.beams) == ("vlp16", 16)
     assert (sensor.height, sensor.axes, sensor.intensity_scale) == (0.9, "y-forward", 255.0)
 
-    assert start()._segment._normalise.sensor.height is None
-    assert start(height=0.0)._segment._normalise.sensor.height == 0
+    assert start()._segment._sensor.height is None
+    assert start(height=0.0)._segment._sensor.height == 0
 
 
 def test_what_is_assumed_of_the_sensor_is_logged_once(start: Callable[..., Any]) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.recordings import Recording
 from amvnet.scan import Scan
 from amvnet.sensors.frame import Frame, find_frame
 from amvnet.sensors.ground import find_ground
-from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
+from amvnet.sensors.lidars import AXES, UNKNOWN_SENSOR, Sensor, rotation_from_degrees
 from amvnet.sensors.normalise import Normaliser
 
 from fixtures.commands import fails
@@ -36,10 +37,11 @@ def tilted(xyz: np.ndarray, pitch: float, roll: float) -> np.ndarray:
     return xyz @ rotation_from_degrees(0, pitch, roll).T
 
 
-def normalise(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]:
+def normalise(xyz: np.ndarray, sensor: Sensor = UNKNOWN_SENSOR) -> tuple[Scan, str]:
     lines: list[str] = []
     intensity = np.linspace(0, 0.6, len(xyz))
-    scan = Normaliser(WEIGHTS.expects, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")
+    recording = Normaliser(WEIGHTS.expects, sensor, lines.append)(Recording("a"))
+    scan = recording.to_scan(Cloud(xyz, intensity, name="a"))
     return scan, lines[0]
 
 
@@ -173,12 +175,12 @@ def test_a_raised_road_is_not_upside_down() -> None:
 
 @pytest.mark.parametrize("tilt", first_of([(8, 0), (0, 8)]))
 def test_scans_that_sway_are_levelled_one_by_one(tilt: tuple[float, float]) -> None:
-    normaliser = Normaliser(WEIGHTS.expects)
+    recording = Normaliser(WEIGHTS.expects)(Recording("a"))
     pitch, roll = tilt
     for seed, side in enumerate((1, -1, 1, -1, 1, -1, 1)):
         xyz = scan_xyz(seed=seed)
         cloud = Cloud(
             tilted(xyz, side * pitch, side * roll), np.linspace(0, 0.6, len(xyz)), name="a"
         )
-        scan = normaliser(cloud, "a")
+        scan = recording.to_scan(cloud)
         np.testing.assert_allclose(scan.points[:, 2], xyz[:, 2], atol=0.2)

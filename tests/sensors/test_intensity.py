@@ -29,7 +29,7 @@ from amvnet.sensors.intensity import (
     match_scan,
     matching,
 )
-from amvnet.sensors.lidars import Sensor, rotation_from_degrees
+from amvnet.sensors.lidars import UNKNOWN_SENSOR, Sensor, rotation_from_degrees
 from amvnet.sensors.measure import MEASURED_SCANS, Measured
 from amvnet.sensors.normalise import Normaliser
 from amvnet.training.expectation import expectation_of
@@ -65,11 +65,11 @@ def weights_with(**how: bool) -> Weights:
 
 
 def normalise(
-    clouds: list[Cloud], sensor: Sensor | None = None, **how: bool
+    clouds: list[Cloud], sensor: Sensor = UNKNOWN_SENSOR, **how: bool
 ) -> tuple[list[Scan], list[str]]:
     lines: list[str] = []
-    normaliser = Normaliser(weights_with(**how).expects, sensor, lines.append)
-    return [normaliser(cloud, "a") for cloud in clouds], lines
+    recording = Normaliser(weights_with(**how).expects, sensor, lines.append)(Recording("a"))
+    return [recording.to_scan(cloud) for cloud in clouds], lines
 
 
 def quantile_gap(intensity: np.ndarray) -> float:
@@ -183,9 +183,10 @@ def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
     for cloud in clouds:
         read = partial(replace, cloud)
         recording.scans.append(ScanFile(cloud.name, recording, Path(cloud.name), read=read))
+    drive = normaliser(recording)
     for cloud in clouds:
         alone, _ = normalise([cloud])
-        scan = normaliser(cloud, recording)
+        scan = drive.to_scan(cloud)
         np.testing.assert_array_equal(scan.points, alone[0].points)
         np.testing.assert_array_equal(scan.row, alone[0].row)
         assert ground_height(scan.points) == pytest.approx(1.73, abs=0.05)
@@ -303,8 +304,8 @@ def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> Non
 
     # The scan is labelled alike as a file: its normaliser leaves the intensities to the segmenter.
     said: list[str] = []
-    normaliser = Normaliser(weights.expects, None, said.append)
-    normalised = normaliser(Cloud(dark[:, :3], dark[:, 3], name="a"), "a")
+    recording = Normaliser(weights.expects, report=said.append)(Recording("a"))
+    normalised = recording.to_scan(Cloud(dark[:, :3], dark[:, 3], name="a"))
     np.testing.assert_allclose(normalised.points[:, 3], dark[:, 3], atol=1e-6)
     assert "spread as in the training" in said[0]
 

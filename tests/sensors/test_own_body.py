@@ -13,6 +13,7 @@ import pytest
 import amvnet
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.recordings import Recording
 from amvnet.inference.journal import read_journals
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
@@ -31,7 +32,8 @@ BOX = (-1.0, -2.0, -0.5, 14.0, 5.0, 0.6)
 def own_of(points: np.ndarray, **sensor: Any) -> np.ndarray:
     """Return the points of the own body in a scan without rings, as a file holds it."""
     cloud = Cloud(points[:, :3], points[:, 3])
-    own = Normaliser(Expectation(), make_sensor(**sensor))(cloud, "drive").own
+    normaliser = Normaliser(Expectation(), make_sensor(**sensor))
+    own = normaliser(Recording("drive")).to_scan(cloud).own
     return np.zeros(len(points), bool) if own is None else own
 
 

@@ -18,6 +18,7 @@ from amvnet.cli.main import main
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.recordings import Recording
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
@@ -32,12 +33,13 @@ from amvnet.sensors.lidars import (
     BUILT_IN,
     KNOWN_HEIGHTS,
     KNOWN_SENSORS,
+    UNKNOWN_SENSOR,
     Sensor,
     make_sensor,
     rotation_from_degrees,
 )
 from amvnet.sensors.measure import MEASURED_SCANS, raise_points
-from amvnet.sensors.normalise import Normaliser, normalised
+from amvnet.sensors.normalise import Normalised, Normaliser, normalised
 from amvnet.sensors.rows import _row_view
 from amvnet.weights.file import built_in, load, save
 from lidarstreets import LIDAR_MODELS
@@ -122,13 +124,13 @@ def test_real_sensors_have_the_height_that_is_known(name: str, model: str) -> No
 # --- normalising
 
 
-def make_normaliser(
-    sensor: Sensor | None = None, name: str = "hdl64e", is_nuscenes: bool = False
-) -> tuple[Normaliser, list[str]]:
-    """Return a normaliser for fresh weights, and the list of the lines that it says."""
+def make_recording(
+    sensor: Sensor = UNKNOWN_SENSOR, name: str = "hdl64e", is_nuscenes: bool = False
+) -> tuple[Normalised, list[str]]:
+    """Return a recording as fresh weights expect it, and the list of the lines that it says."""
     lines: list[str] = []
     weights = trained_for(NUSCENES_WEIGHTS if is_nuscenes else WEIGHTS, name)
-    return Normaliser(weights.expects, sensor, lines.append), lines
+    return Normaliser(weights.expects, sensor, lines.append)(Recording("a")), lines
 
 
 def make_cloud(points: np.ndarray, ring: np.ndarray | None = None) -> Cloud:
@@ -145,8 +147,8 @@ def assert_alike(a: Scan, b: Scan, atol: float = 1e-4) -> None:
 @pytest.mark.parametrize("height", [0.6, 1.73, 2.6])
 def test_the_sensor_is_moved_to_the_height_of_the_training(height: float) -> None:
     points, _ = place(LASERS["os1-64"], height)
-    normaliser, _ = make_normaliser()
-    scan = normaliser(make_cloud(points), "a")
+    recording, _ = make_recording()
+    scan = recording.to_scan(make_cloud(points))
     np.testing.assert_array_equal(scan.points[:, [0, 1, 3]], points[:, [0, 1, 3]])
     assert ground_height(scan.points) == pytest.approx(1.73, abs=0.05)
 
@@ -157,8 +159,8 @@ def test_the_sensor_is_moved_to_the_height_of_the_training(height: float) -> Non
 
 def test_a_given_height_counts_whatever_the_ground_says() -> None:
     points, _ = place(LASERS["os1-64"], 1.2)
-    normaliser, _ = make_normaliser(Sensor(height=2.23))
-    scan = normaliser(make_cloud(points), "a")
+    recording, _ = make_recording(Sensor(height=2.23))
+    scan = recording.to_scan(make_cloud(points))
     np.testing.assert_allclose(scan.points[:, 2] - points[:, 2], 0.5, atol=1e-5)
 
 
@@ -169,16 +171,16 @@ def test_any_frame_that_is_described_gives_the_same_scan(
 ) -> None:
     points, _ = place(LASERS["os1-64"], 1.2)
     points[5] = 0
-    level_normaliser, _ = make_normaliser()
-    expected = level_normaliser(make_cloud(points), "a")
+    level, _ = make_recording()
+    expected = level.to_scan(make_cloud(points))
 
     offset = (0.1, -0.2, 0.4)
     matrix = rotation_from_degrees(*turn) @ np.array(AXES[axes], float)
     file_xyz = (points[:, :3] - offset) @ matrix  # the inverse of matrix @ file_xyz + offset
     file_xyz[5] = 0
 
-    normaliser, _ = make_normaliser(Sensor(axes=axes, rotate=turn, offset=offset))
-    scan = normaliser(Cloud(file_xyz, points[:, 3], None, "a.pcd"), "a")
+    recording, _ = make_recording(Sensor(axes=axes, rotate=turn, offset=offset))
+    scan = recording.to_scan(Cloud(file_xyz, points[:, 3], None, "a.pcd"))
 
     assert_alike(scan, expected)
     assert np.flatnonzero(~scan.valid).tolist() == [5]
@@ -198,8 +200,8 @@ def test_a_scan_knows_the_way_back_from_what_was_measured(unit: str) -> None:
     tilted = points[:, :3] @ rotation_from_degrees(0, 6, -4).T
     for expected in (fresh_weights().expects, None):
         scale = 1000.0 if unit == "mm" else 1.0
-        normaliser = Normaliser(expected, Sensor(unit=unit))
-        scan = normaliser(Cloud(tilted * scale, points[:, 3], None, "a.pcd"), "a")
+        recording = Normaliser(expected, Sensor(unit=unit))(Recording("a"))
+        scan = recording.to_scan(Cloud(tilted * scale, points[:, 3], None, "a.pcd"))
         assert_in_file(scan, tilted)
 
 
@@ -224,7 +226,7 @@ def test_axes_do_not_mirror(axes: Any) -> None:
 def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
     points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
     weights = trained_for(WEIGHTS, "hdl64e")
-    scan = Normaliser(weights.expects)(make_cloud(points), "a")
+    scan = Normaliser(weights.expects)(Recording("a")).to_scan(make_cloud(points))
     np.testing.assert_array_equal(scan.points, points)
 
     segmenter = amvnet.load(weights)
@@ -236,8 +238,8 @@ def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
 
 def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None:
     points, laser = place(LASERS["os1-64"], 0.8)
-    normaliser, _ = make_normaliser()
-    row = normaliser(make_cloud(points), "a").row
+    recording, _ = make_recording()
+    row = recording.to_scan(make_cloud(points)).row
     assert row is not None
 
     rows = []
@@ -266,25 +268,25 @@ def test_weights_with_rings_as_rows_get_the_rows_of_the_training(kind: str) -> N
     random = np.random.default_rng(0).integers(0, 32, len(laser))
     rings = {"none": None, "right": laser, "reversed": 31 - laser, "in pairs": laser ^ 1}
     rings["random"] = random
-    normaliser, _ = make_normaliser(name="hdl32e", is_nuscenes=True)
-    scan = normaliser(make_cloud(points, rings[kind]), "a")
+    recording, _ = make_recording(name="hdl32e", is_nuscenes=True)
+    scan = recording.to_scan(make_cloud(points, rings[kind]))
     np.testing.assert_array_equal(rows_in_nuscenes(scan), 31 - laser)
 
 
 def test_rings_that_are_four_rows_off_do_not_decide_the_rows() -> None:
     """As if a file left out the lowest lasers of the sensor, and numbered the others from 0."""
     points, laser = place(LASERS["hdl32e"], 1.84)
-    normaliser, _ = make_normaliser(name="hdl32e", is_nuscenes=True)
+    recording, _ = make_recording(name="hdl32e", is_nuscenes=True)
     for off in (1, 4):
-        scan = normaliser(make_cloud(points[laser >= off], laser[laser >= off] - off), "a")
+        scan = recording.to_scan(make_cloud(points[laser >= off], laser[laser >= off] - off))
         np.testing.assert_array_equal(rows_in_nuscenes(scan), 31 - laser[laser >= off])
 
 
 def test_points_whose_ring_is_unknown_get_no_row_by_their_ring() -> None:
     points, laser = place(np.linspace(-20, 12, 32), 1.84)
     unknown = np.arange(len(laser)) % 7 == 0
-    normaliser, _ = make_normaliser(Sensor(beams=32), "homemade", is_nuscenes=True)
-    row = normaliser(make_cloud(points, np.where(unknown, -1, laser)), "a").row
+    recording, _ = make_recording(Sensor(beams=32), "homemade", is_nuscenes=True)
+    row = recording.to_scan(make_cloud(points, np.where(unknown, -1, laser))).row
     assert row is not None
     np.testing.assert_array_equal(row, np.where(unknown, -1, 31 - laser))
 
@@ -298,33 +300,34 @@ def rows_in_nuscenes(scan: Scan) -> np.ndarray:
 def test_weights_of_an_unknown_sensor_get_rows_if_the_number_of_lasers_fits() -> None:
     points, laser = place(np.linspace(-20, 12, 32), 1.84)
     for count in (32, 20, None):
-        normaliser, _ = make_normaliser(Sensor(beams=count), "homemade", is_nuscenes=True)
-        row = normaliser(make_cloud(points), "a").row
+        recording, _ = make_recording(Sensor(beams=count), "homemade", is_nuscenes=True)
+        row = recording.to_scan(make_cloud(points)).row
         assert (row is not None) == (count == 32)
         if row is not None:
             np.testing.assert_array_equal(row, 31 - laser)
 
     for ring in (laser, 31 - laser):
-        scan = normaliser(make_cloud(points, ring), "c")
+        scan = recording.to_scan(make_cloud(points, ring))
         np.testing.assert_array_equal(rows_in_nuscenes(scan), 31 - laser)
 
 
 def test_what_was_assumed_is_said_once_for_a_source() -> None:
-    normaliser, lines = make_normaliser()
+    drive, lines = make_recording()
     for seed in range(3):
         points, _ = place(LASERS["vlp16"], 0.9, seed=seed)
         points[:, 3] *= 255
-        normaliser(make_cloud(points), "drive")
+        drive.to_scan(make_cloud(points))
 
     assert len(lines) == 1
     lasers = ("+15 to -15", "hdl64e", "no such sensor")
     for word in ("a.pcd", "0 to 255", "m over the ground", "1.73 m", *lasers):
         assert word in lines[0]
 
-    normaliser(make_cloud(points), "other")  # a recording of the same sensor
+    other, higher = map(drive.normaliser, (Recording("other"), Recording("higher")))
+    other.to_scan(make_cloud(points))  # of the same sensor
     assert len(lines) == 1
     points, _ = place(LASERS["vlp16"], 1.9)
-    normaliser(make_cloud(points), "higher")
+    higher.to_scan(make_cloud(points))
     assert len(lines) == 2
 
 
@@ -332,10 +335,11 @@ def test_recordings_that_are_only_looked_at_share_a_line_if_they_are_alike() -> 
     lines: list[str] = []
     normaliser = Normaliser(report=lines.append)
     points, _ = place(LASERS["vlp16"], 0.9)
-    for source in ("site_a", "site_b", "site_a"):
-        normaliser(make_cloud(points), source)
+    site_a, site_b, site_c = (normaliser(Recording(name)) for name in ("a", "b", "c"))
+    for site in (site_a, site_b, site_a):
+        site.to_scan(make_cloud(points))
     assert len(lines) == 1
-    normaliser(make_cloud(points * np.array([1, 1, 1, 255], np.float32)), "site_c")
+    site_c.to_scan(make_cloud(points * np.array([1, 1, 1, 255], np.float32)))
     assert len(lines) == 2
     assert "0 to 255" in lines[1]
 
@@ -358,7 +362,7 @@ def test_a_sensor_that_is_stated_and_contradicts_the_scan_is_named(
     normaliser = Normaliser(Expectation.of_sensor("hdl64e"), stated, lines.append)
     points, ring = place(LASERS["vlp32c"], 1.75)
     for source in ("drive", "same"):
-        normaliser(make_cloud(points, ring), source)
+        normaliser(Recording(source)).to_scan(make_cloud(points, ring))
     warnings = [line for line in lines if "you state" in line]
     assert len(warnings) == (1 if words else 0)
     assert all(word in warnings[0] for word in words)
@@ -370,9 +374,9 @@ def test_a_sensor_that_is_stated_and_contradicts_the_scan_is_named(
 def test_a_warning_about_another_sensor_names_built_in_weights_that_fit(
     laser: str, advice: str
 ) -> None:
-    normaliser, lines = make_normaliser()
+    recording, lines = make_recording()
     points, _ = place(LASERS[laser], 1.7)
-    normaliser(make_cloud(points), "drive")
+    recording.to_scan(make_cloud(points))
     assert lines[0].endswith(f"have seen no such sensor; {advice}")
 
 
@@ -382,34 +386,34 @@ def test_the_table_of_built_in_weights_has_the_sensors_of_their_files() -> None:
 
 def test_the_sensor_of_the_training_is_said_to_be_familiar_and_in_place() -> None:
     points, _ = place(LIDAR_MODELS["hdl64e"].elevations, 1.73)
-    normaliser, lines = make_normaliser()
-    normaliser(make_cloud(points), "drive")
+    recording, lines = make_recording()
+    recording.to_scan(make_cloud(points))
     assert "no such sensor" not in lines[0]
     assert "moved" not in lines[0]
 
 
-def rise_of(normaliser: Normaliser, points: np.ndarray, source: str) -> float:
-    """Return how far a normaliser moves a scan up, metres."""
-    scan = normaliser(make_cloud(points), source)
+def rise_of(recording: Normalised, points: np.ndarray) -> float:
+    """Return how far a scan of a recording is moved up, metres."""
+    scan = recording.to_scan(make_cloud(points))
     return float((scan.points[:, 2] - points[:, 2]).mean())
 
 
 def test_scans_of_one_source_keep_one_height() -> None:
-    normaliser, _ = make_normaliser()
+    recording, _ = make_recording()
     rises = []
     for seed, height in enumerate((1.0, 1.0, 1.1, 1.0, 1.0, 1.1, 1.1, 1.1, 1.1, 1.1)):
         points, _ = place(LASERS["os1-64"], height, seed=seed)
-        rises.append(rise_of(normaliser, points, "drive"))
+        rises.append(rise_of(recording, points))
 
     assert np.ptp(rises[MEASURED_SCANS:]) < 1e-5
     assert rises[-1] == pytest.approx(1.0 - 1.73, abs=0.03)
 
 
 def test_scans_of_two_robots_in_one_source_get_their_own_heights() -> None:
-    normaliser, _ = make_normaliser()
+    recording, _ = make_recording()
     for height in (1.0, 2.5, 1.0, 2.5):
         points, _ = place(LASERS["os1-64"], height)
-        rise = rise_of(normaliser, points, "mixed")
+        rise = rise_of(recording, points)
         assert rise == pytest.approx(height - 1.73, abs=0.05)
 
 
@@ -418,7 +422,12 @@ COORDINATE = (
     | st.floats(-50, 50, width=32)
     | st.sampled_from([0.0, 1.0, -1.7, 1e4, 3e38])
 )
-STATED = [None, Sensor(fov_up=-40), KNOWN_SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]
+STATED = [
+    UNKNOWN_SENSOR,
+    Sensor(fov_up=-40),
+    KNOWN_SENSORS["vlp16"],
+    Sensor(height=1, rotate=(1, 2, 3)),
+]
 
 
 @with_examples(
@@ -435,17 +444,17 @@ def test_any_numbers_end_in_a_scan_or_one_line(
     rows: list[Any],
     repeated: int,
     has_ring: bool,
-    sensor: Sensor | None,
+    sensor: Sensor,
     trained_for: str,
     is_nuscenes: bool,
 ) -> None:
     points = np.array(rows * repeated, np.float32).reshape(-1, 4)
     cloud = make_cloud(points, np.arange(len(points)) % 40 if has_ring else None)
-    normaliser, _ = make_normaliser(sensor, trained_for, is_nuscenes)
+    recording, _ = make_recording(sensor, trained_for, is_nuscenes)
 
     with contextlib.suppress(InputError):
         for _ in range(2):
-            scan = normaliser(cloud, "a")
+            scan = recording.to_scan(cloud)
             assert len(scan) == len(points)
 
             assert not scan.valid[(points[:, :3] == 0).all(axis=1)].any()
@@ -639,7 +648,7 @@ def test_scans_of_a_benchmark_are_normalised_for_weights_that_do_not_know_its_se
         cloud = Cloud(
             unchanged.points[:, :3], unchanged.points[:, 3], unchanged.ring, name=scan.name
         )
-        alone = Normaliser(expected, Sensor(unit="m"))(cloud, "alone")
+        alone = Normaliser(expected, Sensor(unit="m"))(Recording("alone")).to_scan(cloud)
         np.testing.assert_array_equal(scan.points, alone.points)
         np.testing.assert_array_equal(scan.valid, alone.valid)
         assert 0.1 < 1 - scan.valid.mean() < 0.4  # of the car itself
@@ -670,6 +679,6 @@ def test_a_stated_unit_settles_that_a_sensor_is_high() -> None:
     weights = trained_for(WEIGHTS, "hdl64e")
     points, _ = place(LASERS["os1-64"], 6.0)
     cloud = Cloud(points[:, :3], np.linspace(0, 0.6, len(points)), name="a")
-    fails(lambda: Normaliser(weights.expects)(cloud, "a"), "--unit")
-    assert Normaliser(weights.expects, Sensor(unit="m"))(cloud, "a").valid.any()
-    assert Normaliser(weights.expects, Sensor(height=6.0))(cloud, "a").valid.any()
+    fails(lambda: Normaliser(weights.expects)(Recording("a")).to_scan(cloud), "--unit")
+    for sensor in (Sensor(unit="m"), Sensor(height=6.0)):
+        assert Normaliser(weights.expects, sensor)(Recording("a")).to_scan(cloud).valid.any()

@@ -124,7 +124,7 @@ def normalised(case: Case) -> tuple[Scan, str]:
     cloud = read_file(case.file, ending_of(case.file), UNKNOWN)
     recording = Recording("scans")
     recording.scans.append(ScanFile("scan", recording, case.file, read=lambda: cloud))
-    scan = normaliser(cloud, recording)
+    scan = normaliser(recording).to_scan(cloud)
     (line,) = lines
     return scan, line.removeprefix(f"{case.file}: ")
 

@@ -239,7 +239,7 @@ def reference(path: Path, weights: str | Path, graphs: Path) -> tuple[np.ndarray
     cloud = read_file(path, ending_of(path), UNKNOWN)
     recording = Recording("scans")
     recording.scans.append(ScanFile("scan", recording, path, read=lambda: cloud))
-    scan = normaliser(cloud, recording)
+    scan = normaliser(recording).to_scan(cloud)
 
     result = OnnxSegmenter(graphs)(scan)
     verdict = Verdict(result.uncertain[scan.valid].mean(), loaded.usual_uncertain)

@@ -127,6 +127,7 @@ class CloudSegmenter:
     def _load(self, weights: str) -> None:
         """Load the weights of a name; for "auto", only check the parameters."""
         import amvnet
+        from amvnet.data.recordings import Recording
         from amvnet.runtime.memory import keep_freed_memory
         from amvnet.sensors.lidars import AUTO
         from amvnet.sensors.normalise import Normaliser
@@ -143,7 +144,8 @@ class CloudSegmenter:
             return
         if self._segment.device == "cpu":
             keep_freed_memory()
-        self._normalise = Normaliser(self._segment.weights.expects, self._sensor, self._report)
+        normaliser = Normaliser(self._segment.weights.expects, self._sensor, self._report)
+        self._recording = normaliser(Recording(self._topic))
         self.taxonomy = self._segment.taxonomy
         self.hardware = self._segment.engine.hardware
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)
@@ -165,7 +167,7 @@ class CloudSegmenter:
             self._report(f"weights {name}, {reason}")
             self._load(name)
         assert self.taxonomy is not None
-        scan = self._normalise(cloud, self._topic)
+        scan = self._recording.to_scan(cloud)
         result = self._segment(scan, yaw=0.0 if self._fuse is None else self._fuse.yaw(origin))
         if self._fuse is not None:  # last, because odometry often comes after its scan
             result = self._fuse(origin, scan, result)

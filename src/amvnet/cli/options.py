@@ -15,7 +15,7 @@ from amvnet.errors import InputError, listed
 from amvnet.models.methods import MethodName, widest_method
 from amvnet.outputs import FormatName
 from amvnet.progress import counted
-from amvnet.sensors.lidars import AUTO, Sensor
+from amvnet.sensors.lidars import AUTO, UNKNOWN_SENSOR, Sensor
 
 if TYPE_CHECKING:
     from amvnet.data.class_maps import ClassMap
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 # Only nuScenes has the last two splits.
 SplitName = Literal["train", "val", "test", "all", "mini_train", "mini_val"]
 
-UNKNOWN = Sensor()
 MAX_SEQUENCES = 20  # largest number of sequences that a line names
 
 
@@ -318,7 +317,7 @@ def given_options(choice: Any) -> list[str]:
 
 
 def load_for(
-    inputs: Inputs, weights: str, sensor: Sensor = UNKNOWN, then: str = ""
+    inputs: Inputs, weights: str, sensor: Sensor = UNKNOWN_SENSOR, then: str = ""
 ) -> tuple[str, Weights]:
     """Return the name of the weights for some inputs, and the weights.
 

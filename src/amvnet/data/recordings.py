@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,6 +42,15 @@ class Recording:
         if keep:
             self.kept[scan.read] = cloud
         return cloud
+
+    def scan(self, file: ScanFile) -> Scan:
+        """Read a scan, which keeps the coordinates of its file; raise the errors of `read`."""
+        cloud = self.read(file)
+        return replace(self.to_scan(cloud), file_xyz=cloud.xyz)
+
+    def to_scan(self, cloud: Cloud) -> Scan:
+        """Return the scan of points that were read: unchanged, except by `Normalised`."""
+        return cloud.to_scan()
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.lidars import Sensor
-from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.normalise import Normalised, Normaliser
 
 TRANSFERS = 8  # number of files that are fetched from object storage at the same time
 # The column that says whether an error stops the run, because no labels can be written.
@@ -115,11 +115,12 @@ class LabelScans:
             check_outside(Place.of(row["path"]), self._out)
 
         request = self.request
-        normaliser = Normaliser(request.weights.expects, request.sensor)
         with _fetch(drive, request.layout) as (files, folder):
+            known = None
             if drive[0]["estimates"]:
                 (recording,) = files.recordings()
-                normaliser.recall({recording: parse_estimate(drive[0]["estimates"])})
+                known = (recording, parse_estimate(drive[0]["estimates"]))
+            normaliser = Normaliser(request.weights.expects, request.sensor, known=known)
             files = files.with_classes(request.weights.taxonomy)
             scans = files.normalised_by(normaliser).records()
             pipeline = Pipeline(
@@ -194,9 +195,11 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     # A scan that cannot be read is reported as broken when it is labelled.
     normaliser = Normaliser(request.weights.expects, request.sensor)
     with suppress(Exception), _fetch(drive, request.layout) as (files, _):
+        files = files.normalised_by(normaliser)
         (recording,) = files.recordings()
-        usual = normaliser.measure(recording).usual
-        for scan, row in zip(files.normalised_by(normaliser).records(), drive, strict=True):
+        assert isinstance(recording, Normalised)
+        usual = recording.measured.usual
+        for scan, row in zip(files.records(), drive, strict=True):
             with suppress(InputError):  # the first scan that can be read gives the line
                 assumed = scan.load().assumed.replace(str(scan.path), _shown_path(row))
                 break

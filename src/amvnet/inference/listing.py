@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import overload
@@ -53,7 +53,7 @@ class Inputs:
     def __init__(self, parts: Sequence[Dataset], options: ScanOptions = ScanOptions()) -> None:
         self._parts = parts
         self._options = options
-        self._measured: dict[Recording, Estimate | None] = {}  # in the first part
+        self._known: tuple[Recording, Estimate | None] | None = None  # what chose the weights
 
     def choose_weights(self, sensor: Sensor) -> tuple[str, str]:
         """Return the name of built-in weights for the first recording, and in words why these.
@@ -76,7 +76,7 @@ class Inputs:
         usual = measured.usual
         # If the origin lies on the ground, the lasers were measured as if from this height.
         if measured.is_mixed or (usual is not None and not usual.frame.is_on_ground(sensor)):
-            self._measured[recordings[0]] = usual
+            self._known = (recordings[0], usual)
         lasers = SensorGeometry() if usual is None else usual.lasers
         return weights_for(lasers.override(sensor), classes, measured.is_mixed)
 
@@ -100,6 +100,9 @@ class Inputs:
         Raises:
             InputError: if the inputs have different classes, or a dataset lacks the named ones.
         """
+        if normaliser is not None:
+            normaliser = replace(normaliser, known=self._known)
+            once = cache(normaliser)  # files of one recording may be in several parts
         scans: list[ScanFile] = []
         taxonomies: list[Taxonomy] = []
         for part in self._parts:
@@ -108,9 +111,11 @@ class Inputs:
                 dataset = with_classes(part, taxonomy)
             elif isinstance(part, ScanFiles):
                 dataset = part.with_classes(part.named_classes())
-            if normaliser is not None:
-                dataset = normalised(dataset, normaliser, self._measured)
-                if normaliser.expected is not None and not isinstance(part, ScanFiles):
+            if normaliser is not None and isinstance(part, ScanFiles):
+                dataset = dataset.normalised_by(once)
+            elif normaliser is not None:
+                dataset = normalised(dataset, normaliser)
+                if normaliser.expected is not None:
                     mark = partial(mark_own, sensor=normaliser.sensor)
                     dataset.finish = None if official else mark
             scans += choose_records(dataset, self._options.sequences, self._options.split)

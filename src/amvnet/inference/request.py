@@ -19,10 +19,8 @@ from amvnet.inference.drive import Drives
 from amvnet.inference.pipeline import UNCERTAIN_ENDING, OutputOptions
 from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method, check_two_networks
-from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.lidars import UNKNOWN_SENSOR, Sensor
 from amvnet.weights.file import Weights
-
-UNKNOWN_SENSOR = Sensor()
 
 
 @dataclass(frozen=True)

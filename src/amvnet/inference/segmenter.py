@@ -9,7 +9,7 @@ from pathlib import Path
 
 from amvnet.data.datasets.open import is_dataset
 from amvnet.data.formats.rows import parse_layout
-from amvnet.data.recordings import ScanFile
+from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
@@ -156,7 +156,7 @@ class Segmenter:
             return check_scan(points)
         cloud = array_cloud(points, columns or self.columns)
         if self.sensor.is_known:
-            return self._normaliser()(cloud, "scan")
+            return self._normaliser()(Recording("scan")).to_scan(cloud)
         scan = array_scan(cloud, self.weights.expects.intensity)
         return mark_own(scan, self.sensor)
 

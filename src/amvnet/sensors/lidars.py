@@ -167,6 +167,9 @@ def _are_numbers(values: Any, count: int) -> bool:
     return isinstance(values, tuple) and len(values) == count and all(map(math.isfinite, values))
 
 
+UNKNOWN_SENSOR = Sensor()
+
+
 def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
     """Return the (3, 3) rotation by roll about x, then pitch about y, then yaw about z."""
     angles = np.radians([yaw, pitch, roll])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from amvnet.sensors.lidars import (
     ANY,
     KNOWN_SENSORS,
     UNITS,
+    UNKNOWN_SENSOR,
     Sensor,
     make_sensor,
 )
@@ -97,121 +100,76 @@ def describe(
     )
 
 
+@dataclass(eq=False)
 class Normaliser:
-    """Normalise the scans of recordings, each recording by measuring its first scans.
+    """How recordings are normalised; called with one, it returns the normalised one.
 
-    Args:
+    Attributes:
         expected: the scans that the weights expect. If it is None, scans are only turned by the
             description of the sensor, so that people can look at them.
         sensor: what is known about the scans' sensor; the rest is measured.
         report: called with `Scan.assumed`, once for all recordings of one sensor, and once more if
             a recording has scans from other sensors.
+        known: a recording that was measured before, and what was measured of it (`Measured.usual`).
     """
 
-    def __init__(
-        self,
-        expected: Expectation | None = None,
-        sensor: Sensor | None = None,
-        report: Reporter = report_nothing,
-    ) -> None:
-        self.expected = expected
-        self.sensor = sensor or Sensor()
-        self._report = report
-        self._measured: dict[Recording | str, Measured] = {}
-        self._latest: Recording | None = None  # the one that was measured last
-        # What was assumed of the usual sensor of each recording, and of its other sensors.
-        self._assumed: dict[tuple[Recording | str, bool], str] = {}
-        self._turned: set[str] = set()  # what was reported of scans that are only turned
-        self._described: list[tuple[str, Estimate]] = []  # notes and estimates in these lines
+    expected: Expectation | None = None
+    sensor: Sensor = UNKNOWN_SENSOR
+    report: Reporter = report_nothing
+    known: tuple[Recording, Estimate | None] | None = None
+    _latest: Recording | None = field(default=None, init=False)  # the one that was measured last
+    _measured: list[Measured] = field(default_factory=list, init=False)  # of all so far
+    # What was reported: of scans that are only turned, and notes and estimates of others.
+    _turned: set[str] = field(default_factory=set, init=False)
+    _described: list[tuple[str, Estimate]] = field(default_factory=list, init=False)
+
+    def __call__(self, recording: Recording) -> Normalised:
+        """Return the recording with its scans as the weights expect them."""
+        return Normalised(recording, self)
 
     def quiet(self) -> None:
         """Report nothing more."""
-        self._report = report_nothing
+        self.report = report_nothing
 
-    def scan(self, file: ScanFile) -> Scan:
-        """Read a scan as the weights expect it; it keeps the coordinates of its file.
-
-        Raises:
-            InputError: if it cannot be read; or as `__call__`.
-        """
-        if self.expected is not None:
-            self.measure(file.recording)  # which may keep this scan in memory
-        cloud = file.recording.read(file)
-        return dataclasses.replace(self(cloud, file.recording), file_xyz=cloud.xyz)
-
-    def __call__(self, cloud: Cloud, recording: Recording | str) -> Scan:
-        """Return a scan as the weights expect it; its points keep their order and number.
-
-        Args:
-            recording: the recording, or the name of one in memory.
-
-        Raises:
-            InputError: if no point is usable, or the unit of the coordinates is in doubt.
-        """
-        if self.expected is None:
-            return self._turn(cloud, recording)
-
-        source = recording if isinstance(recording, str) else recording.name
-        measured = self.measure(recording)
-        estimate, is_usual = measured.estimate(cloud)
-        self._check_height(cloud, estimate.frame)
-        scan, ring_fault = normalise(cloud, estimate, self.sensor, self.expected)
-
-        key = (recording, is_usual)
-        is_new = key not in self._assumed
-        if is_new or measured.is_mixed:
-            line = describe(cloud, estimate, self.sensor, self.expected, ring_fault)
-            if measured.is_mixed:
-                line += f"; {source} has scans of other sensors, so that each is measured alone"
-            if not is_usual:
-                line += f"; another sensor or scale of intensity than {source} begins with"
-            lines = [line]
-            stated = estimate.contradiction(self.sensor)
-            if stated:
-                lines.append(f"warning: {cloud.name}: you state {stated}; correct the sensor")
-            self._assumed[key] = "; ".join(lines)
-            is_described = self._is_described(cloud, estimate)
-            if (is_new and (not is_usual or measured.is_mixed)) or not is_described:
-                for line in lines:
-                    self._report(line)
-        return dataclasses.replace(scan, assumed=self._assumed[key])
-
-    def _is_described(self, cloud: Cloud, estimate: Estimate) -> bool:
-        for note, other in self._described:
-            if note == cloud.note and estimate.is_near(other):
-                return True
-        self._described.append((cloud.note, estimate))
-        return False
-
-    def measure(self, recording: Recording | str) -> Measured:
-        """Return what is measured of a recording; the first call measures its first scans.
-
-        They are measured even if another process or run normalises them.
-        """
-        if recording not in self._measured:
-            measured = self._begin(recording)
-            if isinstance(recording, Recording):
-                if self._latest is not None:
-                    self._latest.kept.clear()
-                self._latest = recording
-                measured.learn(recording.first(MEASURED_SCANS))
-        return self._measured[recording]
-
-    def recall(self, measured: Mapping[Recording, Estimate | None]) -> None:
-        """Normalise the scans of some recordings by estimates that were measured before."""
-        for recording, usual in measured.items():
-            self._begin(recording).recall(usual)
-
-    def _begin(self, recording: Recording | str) -> Measured:
+    def measure(self, recording: Recording) -> Measured:
+        """Measure the first scans of a recording, even if another process or run did so."""
         assert self.expected is not None
-        self._measured[recording] = Measured(self.sensor, self.expected.sensor.height)
-        return self._measured[recording]
+        measured = Measured(self.sensor, self.expected.sensor.height)
+        self._measured.append(measured)
+        if self.known is not None and self.known[0] is recording:
+            measured.recall(self.known[1])
+            return measured
+
+        if self._latest is not None:
+            self._latest.kept.clear()
+        self._latest = recording
+        measured.learn(recording.first(MEASURED_SCANS))
+        return measured
+
+    def tell(self, lines: Sequence[str], cloud: Cloud, estimate: Estimate, is_other: bool) -> None:
+        """Report what is assumed of a scan if the like was not yet, or it is another sensor's."""
+        is_described = any(
+            note == cloud.note and estimate.is_near(other) for note, other in self._described
+        )
+        if not is_described:
+            self._described.append((cloud.note, estimate))
+        if is_other or not is_described:
+            for line in lines:
+                self.report(line)
+
+    def tell_turned(self, name: str, assumed: str) -> str:
+        """Return the line on a scan that is only turned; report it if the like was not yet."""
+        line = f"{name}: assumed {assumed}"
+        if assumed not in self._turned:
+            self.report(line)
+        self._turned.add(assumed)
+        return line
 
     def for_sensor(self, sensor: Sensor) -> Normaliser:
         """Return a normaliser for the same weights and the scans of a described sensor."""
         keep_own = self.sensor.keep_own or sensor.keep_own
         described = dataclasses.replace(sensor, keep_own=keep_own)
-        return Normaliser(self.expected, described, self._report)
+        return dataclasses.replace(self, sensor=described)
 
     def target(self) -> SensorGeometry:
         """Return the geometry of a sensor for weights that are trained on the normalised scans.
@@ -220,8 +178,7 @@ class Normaliser:
         the rows of the range image are rings, they are the lasers that decide the rows instead.
         """
         assert self.expected is not None
-        usual = [measured.usual for measured in self._measured.values()]
-        medians = [estimate for estimate in usual if estimate is not None]
+        medians = [measured.usual for measured in self._measured if measured.usual is not None]
         lasers = self.expected.lasers
         height = self.expected.sensor.height
         if medians:
@@ -232,38 +189,91 @@ class Normaliser:
 
         return dataclasses.replace(lasers, height=height)
 
-    def _check_height(self, cloud: Cloud, frame: Frame) -> None:
-        """Check that the ground is not too deep for coordinates in metres."""
-        is_known = self.sensor.height is not None or self.sensor.unit is not None
-        if not is_known and frame.height is not None and frame.height > MAX_SENSOR_HEIGHT:
-            raise InputError(
-                f"{cloud.name}: expected a sensor at most {MAX_SENSOR_HEIGHT:g} m over the ground, "
-                f"found {frame.height:.1f}; give --unit ft if these are feet, else --height"
-            )
 
-    def _turn(self, cloud: Cloud, recording: Recording | str) -> Scan:
+class Normalised(Recording):
+    """A recording as some weights expect it; a `Normaliser` makes it."""
+
+    def __init__(self, recording: Recording, normaliser: Normaliser) -> None:
+        super().__init__(recording.name, recording.scans, recording.kept)
+        self._recording = recording
+        self.normaliser = normaliser
+        # What was assumed of the usual sensor, and of other sensors.
+        self._assumed: dict[bool, str] = {}
+
+    @cached_property
+    def measured(self) -> Measured:
+        """What is measured of the sensor, once, on the first scans."""
+        return self.normaliser.measure(self._recording)
+
+    def scan(self, file: ScanFile) -> Scan:
+        """Read a scan as the weights expect it; it keeps the coordinates of its file.
+
+        Raises:
+            InputError: if it cannot be read; or as `to_scan`.
+        """
+        if self.normaliser.expected is not None:
+            self.measured  # noqa: B018  # which may keep this scan in memory
+        return super().scan(file)
+
+    def to_scan(self, cloud: Cloud) -> Scan:
+        """Return a scan as the weights expect it; its points keep their order and number.
+
+        Raises:
+            InputError: if no point is usable, or the unit of the coordinates is in doubt.
+        """
+        expected = self.normaliser.expected
+        sensor = self.normaliser.sensor
+        if expected is None:
+            return self._turn(cloud, sensor)
+
+        estimate, is_usual = self.measured.estimate(cloud)
+        _check_height(cloud, estimate.frame, sensor)
+        scan, ring_fault = normalise(cloud, estimate, sensor, expected)
+
+        is_new = is_usual not in self._assumed
+        is_mixed = self.measured.is_mixed
+        if is_new or is_mixed:
+            line = describe(cloud, estimate, sensor, expected, ring_fault)
+            if is_mixed:
+                line += f"; {self.name} has scans of other sensors, so that each is measured alone"
+            if not is_usual:
+                line += f"; another sensor or scale of intensity than {self.name} begins with"
+            lines = [line]
+            stated = estimate.contradiction(sensor)
+            if stated:
+                lines.append(f"warning: {cloud.name}: you state {stated}; correct the sensor")
+            self._assumed[is_usual] = "; ".join(lines)
+            is_other = is_new and (not is_usual or is_mixed)
+            self.normaliser.tell(lines, cloud, estimate, is_other)
+        return dataclasses.replace(scan, assumed=self._assumed[is_usual])
+
+    def _turn(self, cloud: Cloud, sensor: Sensor) -> Scan:
         """Return a scan that is only turned, by the description of the sensor."""
-        xyz = self.sensor.to_level(cloud.xyz)
-        scale = self.sensor.intensity_scale or cloud.intensity_scale()
+        xyz = sensor.to_level(cloud.xyz)
+        scale = sensor.intensity_scale or cloud.intensity_scale()
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
 
-        key = (recording, True)
-        if key not in self._assumed:
+        if not self._assumed:
             has_intensity = cloud.intensity is not None and scale is not None
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
             negative = _describe_negative(cloud)
-            parts = [cloud.note, intensity, negative, f"axes {self.sensor.axes or 'x-forward'}"]
+            parts = [cloud.note, intensity, negative, f"axes {sensor.axes or 'x-forward'}"]
             assumed = ", ".join(filter(None, parts))
-            if assumed not in self._turned:
-                self._report(f"{cloud.name}: assumed {assumed}")
-            self._turned.add(assumed)
-            self._assumed[key] = f"{cloud.name}: assumed {assumed}"
-        return dataclasses.replace(scan, to_file=self.sensor.to_file(), assumed=self._assumed[key])
+            self._assumed[True] = self.normaliser.tell_turned(cloud.name, assumed)
+        return dataclasses.replace(scan, to_file=sensor.to_file(), assumed=self._assumed[True])
 
 
-def normalised(
-    dataset: Dataset, normaliser: Normaliser, measured: Mapping[Recording, Estimate | None] = {}
-) -> Dataset:
+def _check_height(cloud: Cloud, frame: Frame, sensor: Sensor) -> None:
+    """Check that the ground is not too deep for coordinates in metres."""
+    is_known = sensor.height is not None or sensor.unit is not None
+    if not is_known and frame.height is not None and frame.height > MAX_SENSOR_HEIGHT:
+        raise InputError(
+            f"{cloud.name}: expected a sensor at most {MAX_SENSOR_HEIGHT:g} m over the ground, "
+            f"found {frame.height:.1f}; give --unit ft if these are feet, else --height"
+        )
+
+
+def normalised(dataset: Dataset, normaliser: Normaliser) -> Dataset:
     """Return a dataset whose scans are normalised as scan files are.
 
     The scans of benchmarks stay unchanged, because weights are trained on such scans, unless the
@@ -272,7 +282,6 @@ def normalised(
     Args:
         normaliser: normalises the scans. If it knows nothing of the sensor, what the dataset's YAML
             file says of it counts.
-        measured: estimates of recordings that were measured before.
 
     Raises:
         InputError: if the YAML file describes an impossible sensor.
@@ -284,8 +293,6 @@ def normalised(
         normaliser = normaliser.for_sensor(Sensor(unit="m"))
     elif dataset.described_sensor is not None and not normaliser.sensor.is_known:
         normaliser = normaliser.for_sensor(described_sensor(dataset))
-
-    normaliser.recall(measured)
     return dataset.normalised_by(normaliser)
 
 

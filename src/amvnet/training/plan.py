@@ -323,7 +323,7 @@ def _report_recordings(dataset: Dataset, normaliser: Normaliser, report: Reporte
     recordings = dataset.recordings()
     for recording in recordings[:MAX_MEASURED_RECORDINGS]:
         with suppress(InputError):  # the check of the scans reports broken ones
-            normaliser.scan(recording.scans[0])
+            recording.scan(recording.scans[0])
     more = len(recordings) - MAX_MEASURED_RECORDINGS
     rest = f"; {counted(more, 'further recording')} not shown" if more > 0 else ""
     report(f"{dataset.spec}: if an assumption is wrong, state the right value under sensor{rest}")

@@ -6,7 +6,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,15 +21,8 @@ from amvnet.files import inside
 from amvnet.progress import counted
 from amvnet.scan import Scan
 
-
-class Normalise(Protocol):
-    """Makes scans as some weights expect them."""
-
-    def scan(self, file: ScanFile) -> Scan:
-        """Read a scan; it keeps the coordinates of its file."""
-
-    def __call__(self, cloud: Cloud, recording: Recording | str) -> Scan:
-        """Return the scan of points in memory."""
+# Returns a recording whose scans are as some weights expect them.
+Normalise = Callable[[Recording], Recording]
 
 
 class Dataset(ABC):
@@ -46,7 +39,7 @@ class Dataset(ABC):
             weights that do not know it; "" if all scans stay unchanged: other sensors' scans often
             have the layout of SemanticKITTI, and so have those that weights are trained on.
         ids_advice: what a user can do about an unknown id in labels; None is advice on files.
-        normalise: makes scans of the points in the files; without it, points stay unchanged.
+        normalise: what the recordings are normalised by; None if points stay unchanged.
         finish: takes each scan that `ScanFile.load` reads, and returns it as labels need it.
     """
 
@@ -139,7 +132,7 @@ class Dataset(ABC):
         if self.normalise is None:
             return scan
         cloud = Cloud(scan.points[:, :3], scan.points[:, 3], scan.ring, name=scan.name)
-        normalised = self.normalise(cloud, scan.name)
+        normalised = self.normalise(Recording(scan.name)).to_scan(cloud)
         labels = scan.labels
         if labels is not None and normalised.own is not None:
             labels = np.where(normalised.own, 0, labels).astype(labels.dtype)

@@ -28,15 +28,9 @@ class ScanFiles(Dataset):
         taxonomy: the classes of their labels.
     """
 
-    def __init__(
-        self,
-        scans: Iterable[ScanFile],
-        taxonomy: Taxonomy = SEMANTICKITTI,
-        normalise: Normalise | None = None,
-    ) -> None:
+    def __init__(self, scans: Iterable[ScanFile], taxonomy: Taxonomy = SEMANTICKITTI) -> None:
         super().__init__(Path(), taxonomy)
         self._scans = [replace(scan, dataset=self) for scan in scans]
-        self.normalise = normalise
 
     def parts(self) -> dict[str, tuple[str, ...]]:
         """Return no sequences: files have no splits."""
@@ -56,11 +50,13 @@ class ScanFiles(Dataset):
 
     def normalised_by(self, normalise: Normalise) -> ScanFiles:
         """Return the same scans, normalised."""
-        return ScanFiles(self._scans, self.taxonomy, normalise)
+        recordings = {recording: normalise(recording) for recording in self.recordings()}
+        scans = (replace(scan, recording=recordings[scan.recording]) for scan in self._scans)
+        return ScanFiles(scans, self.taxonomy)
 
     def with_classes(self, taxonomy: Taxonomy) -> ScanFiles:
         """Return the same scans with other classes."""
-        return ScanFiles(self._scans, taxonomy, self.normalise)
+        return ScanFiles(self._scans, taxonomy)
 
     def named_classes(self) -> Taxonomy:
         """Return the classes that the first file names, or those that its name stands for."""
@@ -69,10 +65,7 @@ class ScanFiles(Dataset):
 
     def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan, which keeps the coordinates of its file."""
-        if self.normalise is not None:
-            return self.normalise.scan(record)
-        cloud = record.recording.read(record)
-        return replace(cloud.to_scan(), file_xyz=cloud.xyz)
+        return record.recording.scan(record)
 
     def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
         """Do not call this: no scan has labels."""

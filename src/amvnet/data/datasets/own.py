@@ -117,7 +117,7 @@ class OwnScans(Dataset):
 
     def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan."""
-        scan = record.read().to_scan() if self.normalise is None else self.normalise.scan(record)
+        scan = record.recording.scan(record)
         self._counts[record.name] = len(scan)
         ids = self.labels(record, len(scan)) if labels else None
         return dataclasses.replace(scan, labels=ids, name=record.name, file_xyz=None)
@@ -169,7 +169,11 @@ class OwnScans(Dataset):
 
     def normalised_by(self, normalise: Normalise) -> OwnScans:
         """Return the same scans, normalised."""
-        return OwnScans(self.description, normalise, self._scans)
+        recordings = {recording: normalise(recording) for recording in self.recordings()}
+        scans = {}
+        for name, scan in self._scans.items():
+            scans[name] = dataclasses.replace(scan, recording=recordings[scan.recording])
+        return OwnScans(self.description, normalise, scans)
 
     def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
         """Return the same scans with other classes for predictions; labels are not read."""
