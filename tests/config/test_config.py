@@ -195,6 +195,7 @@ def test_a_users_file_may_build_on_another_users_file(tmp_path: Path) -> None:
         "model: {range_net: {dropout: 1}}",
         "model: {polar_net: {point_widths: [8]}}",
         "model: {polar_net: {widths: []}}",
+        "model: {polar_net: {decoder: [64, 64]}}",
         "model: {point_head: {hidden: []}}",
         "training: {rv: {epochs: 0}}",
         "training: {bev: {lr: 0}}",

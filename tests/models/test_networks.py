@@ -226,6 +226,26 @@ def test_the_paper_size_range_net_costs_500_gmac_and_decodes_the_strides_4_to_12
     assert gmac == pytest.approx(500, rel=0.1)
 
 
+@pytest.mark.parametrize("recipe", ["semantickitti", "nuscenes"])
+def test_the_paper_size_polar_net_is_that_of_its_authors(recipe: str) -> None:
+    model = load_recipe(recipe).model
+    with torch.device("meta"):  # without memory
+        net = PolarNet(model.polar_net, model.polar_view.vertical, 19)
+
+    widths = [
+        [layer.out_channels for layer in block.modules() if isinstance(layer, RingConv2d)]
+        for block in (net.first, *net.down, *net.up)
+    ]
+    assert widths == [[width] * 2 for width in (64, 128, 256, 512, 512, 256, 128, 64, 64)]
+    assert isinstance(net.norm, nn.BatchNorm2d)
+    parameters = sum(parameter.numel() for parameter in net.parameters())
+    assert parameters == pytest.approx(13.6e6, rel=0.01)
+
+    # The authors' code makes each cell the centre of a dropped square of 7 x 7 with 0.5 / 7 ** 2.
+    assert net.drop.size == 7
+    assert net.drop.probability == pytest.approx(1 - (1 - 0.5 / 49) ** 49, abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("recipe", "weights"),
     [("simulated-compact", "sim-hdl64e"), ("simulated-hdl32e-compact", "sim-hdl32e")],
@@ -325,7 +345,8 @@ def test_folded_batch_norms_change_no_output_of_a_network(case: Case) -> None:
 
     freeze(net)
     torch.testing.assert_close(case.run(net, 3), before, rtol=1e-4, atol=1e-4)
-    assert count_norms(net) == 1  # the norm of the input stays: no layer is before it
+    # The norms of the inputs of the MLP and of the U-Net stay: no layer is before them.
+    assert count_norms(net) == 1 + isinstance(getattr(net, "norm", None), nn.BatchNorm2d)
 
 
 def test_dropblock_is_identity_in_eval_and_at_probability_zero() -> None:

@@ -235,6 +235,18 @@ def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: P
     assert recipe["training"]["rv"]["epochs"] == 1
 
 
+def test_a_decoder_with_channels_of_its_own_is_trained_and_labels(
+    world: Path, tmp_path: Path
+) -> None:
+    options = ("--model.polar_net.decoder", "[12]", "--model.polar_net.input_norm", "true")
+    weights = train(world, tmp_path / "run", "--stage", "bev", *options)
+    assert weights.model.polar_net.decoder == (12,)
+    assert weights.tensors["polar_net.norm.running_mean"].any()
+    assert weights.tensors["polar_net.scores.weight"].shape[1] == 12
+
+    succeed("predict", world / "data", "--weights", tmp_path / "run", "--out", tmp_path / "labels")
+
+
 @pytest.mark.parametrize("stage", [pytest.param("rv", marks=pytest.mark.full), "bev"])
 def test_a_network_learns_a_tiny_dataset_by_heart(world: Path, tmp_path: Path, stage: str) -> None:
     epochs = (f"--training.{stage}.epochs", 20)

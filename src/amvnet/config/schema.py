@@ -178,8 +178,14 @@ class PolarNetConfig(Bounded):
     """Channels of a pillar after pooling."""
     widths: tuple[Channels, ...] = (64, 128, 256, 512, 512)
     """Channels of the levels of the U-Net, from fine to coarse."""
+    decoder: tuple[Channels, ...] = ()
+    """Channels of the levels of the U-Net's decoder, from coarse to fine, one level fewer than
+    `widths`; none: the channels of `widths`. The authors' code: 256, 128, 64, 64."""
+    input_norm: bool = False
+    """Normalise the map of the pillars by batch norm before the U-Net, as in the authors' code."""
     dropblock: Annotated[float, Range(0, 0.99)] = 0.5
-    """Probability that DropBlock drops a cell of the decoder's maps in training."""
+    """Probability that DropBlock drops a cell of the decoder's maps in training. 0.395 is the
+    share that the authors' code drops with its p = 0.5."""
     dropblock_size: Annotated[int, Range(1, 99)] = 7
     """Side of the squares that DropBlock drops, cells."""
 
@@ -189,6 +195,12 @@ class PolarNetConfig(Bounded):
         layers = len(self.point_widths)
         self.check(layers > 1, "two or more point_widths", str(layers))
         self.check(len(self.widths) > 0, "one or more widths", "none")
+        levels = len(self.widths) - 1
+        self.check(
+            len(self.decoder) in (0, levels),
+            f"{levels} values of decoder, one fewer than widths",
+            str(len(self.decoder)),
+        )
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ PART_ON_GPU = 2**18  # number of points encoded at a time on a GPU, which keep i
 class PolarNet(nn.Module):
     """The network that takes a `PolarGrid` and returns the logits of its M occupied pillars.
 
-    The logits are (M, Z * K): K (`classes`) for each of the Z (`vertical`) voxels of a pillar.
+    The logits are (M, Z * K): K (`classes`) for each of the Z (`vertical`) voxels of a pillar. The
+    decoder's last map has C channels.
     """
 
     def __init__(self, config: PolarNetConfig, vertical: int, classes: int) -> None:
@@ -32,15 +33,19 @@ class PolarNet(nn.Module):
         )
 
         # The U-Net goes from fine to coarse maps and back.
+        self.norm = nn.BatchNorm2d(config.pillar) if config.input_norm else nn.Identity()
         self.first = _double(config.pillar, widths[0])
         self.down = nn.ModuleList()
         for fine, coarse in pairwise(widths):
             self.down.append(_double(fine, coarse))
         self.up = nn.ModuleList()
-        for coarse, fine in pairwise(reversed(widths)):
-            self.up.append(_double(coarse + fine, fine))
+        decoder = config.decoder or tuple(reversed(widths[:-1]))
+        coarse = widths[-1]
+        for fine, width in zip(reversed(widths[:-1]), decoder, strict=True):
+            self.up.append(_double(coarse + fine, width))
+            coarse = width
         self.drop = DropBlock(config.dropblock, config.dropblock_size)
-        self.scores = nn.Conv2d(widths[0], vertical * classes, 1)
+        self.scores = nn.Conv2d(coarse, vertical * classes, 1)
 
     def forward(self, grid: PolarGrid) -> Tensor:
         return self.decode(grid, self.unet(self.encode(grid)))
@@ -50,7 +55,7 @@ class PolarNet(nn.Module):
         return grid.to_map(self.compress(self.pool(grid)))
 
     def decode(self, grid: PolarGrid, decoded: Tensor) -> Tensor:
-        """Return the logits (M, Z * K), given the U-Net's output (B, widths[0], R, A)."""
+        """Return the logits (M, Z * K), given the U-Net's output (B, C, R, A)."""
         # Most pillars are empty and need no logits.
         return self.score(grid.at_pillars(decoded))
 
@@ -60,11 +65,11 @@ class PolarNet(nn.Module):
         part = PART_ON_CPU if grid.features.is_cpu else PART_ON_GPU
         return grid.pool_by_parts(self.point_mlp, part)
 
-    def score(self, pillars: Tensor) -> Tensor:  # (M, widths[0]) -> (M, Z * K)
+    def score(self, pillars: Tensor) -> Tensor:  # (M, C) -> (M, Z * K)
         return linear(pillars, self.scores.weight.flatten(1), self.scores.bias)
 
-    def unet(self, x: Tensor) -> Tensor:  # (B, pillar, R, A) -> (B, widths[0], R, A)
-        x = self.first(x)
+    def unet(self, x: Tensor) -> Tensor:  # (B, pillar, R, A) -> (B, C, R, A)
+        x = self.first(self.norm(x))
         skips = [x]
         for down in self.down:
             x = down(F.max_pool2d(x, 2, ceil_mode=True))
