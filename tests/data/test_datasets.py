@@ -242,6 +242,19 @@ def test_nuscenes_without_lidarseg_or_sensor_tables(tmp_path: Path) -> None:
     assert dataset.read(first_record(dataset, layout)).labels is None
 
 
+def test_scans_that_are_not_in_the_table_of_labels_count_as_unlabelled(tmp_path: Path) -> None:
+    layout = make_nuscenes(tmp_path)
+    table = tmp_path / "v1.0-mini/lidarseg.json"
+    listed = [row for row in json.loads(table.read_text()) if "0103-9" not in str(row)]
+    table.write_text(json.dumps(listed))
+    dataset = open_dataset(layout.spec)
+    records = dataset.records(layout.sequences)
+    labelled = dataset.labelled(records)
+    (unlabelled,) = (record for record in records if record not in labelled)
+    assert unlabelled.name == "scene-0103-9"
+    fails(lambda: dataset.labelled([unlabelled]), "labelled scans", "1 scan")
+
+
 def test_nuscenes_tables_that_cannot_be_used(tmp_path: Path) -> None:
     layout = make_nuscenes(tmp_path)
     folder = tmp_path / "v1.0-mini"

@@ -74,7 +74,7 @@ class Dataset(ABC):
         return tuple(name for name in names if name in labelled)
 
     def lacks(self, split: str) -> str:
-        """Return the error that says what a split without a sequence lacks."""
+        """Return the message that says what a split without a sequence lacks."""
         return f"{self.spec}: expected sequences of the split {split}, found none; name others"
 
     def sequences(self, name: str) -> Names:

@@ -25,8 +25,8 @@ from amvnet.files import checked_token
 from amvnet.scan import Scan
 
 CHANNEL = "LIDAR_TOP"
-FOLDERS = ("samples", "sweeps", "lidarseg", "maps")  # next to the folders of the tables
-MAX_LISTED = 20  # limit on the scenes in a message
+FOLDERS = ("samples", "sweeps", "lidarseg", "maps")  # beside the folders of the tables, v1.0-*
+MAX_LISTED = 20  # largest number of scenes that a message lists
 MINI = "v1.0-mini"
 TEST = "v1.0-test"
 
@@ -45,7 +45,7 @@ def _scene_names(numbers: str) -> frozenset[str]:
 
 
 SPLITS = ("train", "val", "test", "all", "mini_train", "mini_val")
-# The official splits. A scene in none of these belongs to "train".
+# The official splits. A scene of v1.0-trainval that is not in VAL belongs to "train".
 MINI_TRAIN = _scene_names("61 553 655 757 796 1077 1094 1100")
 MINI_VAL = _scene_names("103 916")
 VAL = _scene_names(
@@ -108,14 +108,15 @@ class NuScenes(Dataset):
         return splits
 
     def lacks(self, split: str) -> str:
-        """Return the error that says which files to unpack, or which scenes to name instead."""
+        """Return the message that says which files to unpack, or which scenes to name instead."""
         on_disk = self.parts()["all"]
-        unseen = [scene for scene in on_disk if not self._split(scene).endswith("train")]
-        advice = f"or name {not_trained_on(unseen)}" if on_disk else "which the tables list"
+        of_training = ("train", "mini_train")
+        unseen = [scene for scene in on_disk if self._split(scene) not in of_training]
+        instead = f"or name {not_trained_on(unseen)}" if on_disk else "which the tables list"
         return (
             f"{self.root / 'samples' / CHANNEL}: expected scans of {split} scenes "
             f"({len(self.scenes(split))} in the tables of {self.version}), found none; "
-            f"unpack their files, {advice}"
+            f"unpack their files, {instead}"
         )
 
     def scenes(self, split: str) -> tuple[str, ...]:
@@ -148,7 +149,7 @@ class NuScenes(Dataset):
         return records
 
     def read(self, record: ScanFile, labels: bool = True) -> Scan:
-        """Read one scan, with the ring of every point."""
+        """Read one scan, with intensities in [0, 1] and the ring of every point."""
         path = record.path
         table = read_table(path, np.float32, NUSCENES_COLUMNS)
         points = check_usable(np.ascontiguousarray(table[:, :4]), path)
@@ -169,9 +170,10 @@ class NuScenes(Dataset):
         changed.normalise = normalise
         changed._recordings = {}
         for scene, recording in self._recordings.items():
-            changed._recordings[scene] = same = Recording(scene)
+            copied = Recording(scene)
             for scan in recording.scans:
-                same.scans.append(replace(scan, recording=same, dataset=changed))
+                copied.scans.append(replace(scan, recording=copied, dataset=changed))
+            changed._recordings[scene] = copied
         return changed
 
     def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
@@ -185,16 +187,17 @@ class NuScenes(Dataset):
         return self._category_train_ids
 
     def labelled(self, records: Sequence[ScanFile]) -> list[ScanFile]:
-        """Return the scans; raise InputError if the tables have no labels at all."""
+        """Return the scans whose labels the tables list; their files may be missing."""
         if not self._label_files:
             raise InputError(
                 f"{self.root / self.version / 'lidarseg.json'}: expected the table of the labels, "
                 "found none; unpack nuScenes-lidarseg into the same folder"
             )
-        return list(records)
+        labelled = [record for record in records if record.labels_path is not None]
+        return labelled or super().labelled(records)
 
     def poses(self, records: Sequence[ScanFile]) -> Poses | None:
-        """Return the poses of the LiDAR, from the tables of the car's poses and of its sensors."""
+        """Return the poses (N, 4, 4) of the LiDAR: the car's poses, and the LiDAR's on the car."""
         with self._using_tables():
             ego = self._motions("ego_pose")
             sensor = self._motions("calibrated_sensor")
@@ -206,7 +209,7 @@ class NuScenes(Dataset):
             return np.array(poses)
 
     def _motions(self, table: str) -> dict[str, Poses]:
-        """Return the (4, 4) motions of a table by their tokens."""
+        """Return the motions (4, 4) of a table, by their tokens."""
         from scipy.spatial.transform import Rotation
 
         rows = self._table(table)
@@ -228,18 +231,19 @@ class NuScenes(Dataset):
         taxonomy: Taxonomy | None = None,
         count: int | None = None,
     ) -> Path:
-        """Write train ids without a 0: the benchmark's server refuses points without a class.
+        """Write train ids; in the classes of nuScenes, points without one get the most frequent.
 
-        Lost returns get the most frequent class of the scan.
+        Its server refuses points without a class, as lost returns are.
         """
         is_lost = ids == 0
-        if taxonomy is None and is_lost.any() and not is_lost.all():
+        is_for_server = taxonomy is None
+        if is_for_server and is_lost.any() and not is_lost.all():
             classes, counts = np.unique(ids[~is_lost], return_counts=True)
             ids = np.where(is_lost, classes[counts.argmax()], ids)
         return super().write_prediction(record, folder, ids, taxonomy, count)
 
     def _find_version(self, version: str | None) -> str:
-        """Return the given version, or the only version in the folder."""
+        """Return the given version, or the only one in the folder; raise InputError if in doubt."""
         folders = filter(Path.is_dir, self.root.glob("v1.0-*"))
         present = sorted(folder.name for folder in folders)
         if version is None and len(present) == 1:
@@ -256,7 +260,7 @@ class NuScenes(Dataset):
         )
 
     def _using_tables(self) -> AbstractContextManager[None]:
-        """Turn the errors of rows that lack an entry, or have another one, into an InputError."""
+        """Turn the errors of rows without an entry, or with a wrong one, into an InputError."""
 
         def message(error: BaseException) -> str:
             return (
@@ -267,7 +271,7 @@ class NuScenes(Dataset):
         return one_line_errors(message, only=(KeyError, TypeError, IndexError, ValueError))
 
     def _table(self, name: str, required: bool = True) -> list[Row]:
-        """Read one table; return no rows if an optional table is missing."""
+        """Read one table; return no rows if it is missing and not `required`."""
         path = self.root / self.version / f"{name}.json"
         if not path.is_file():
             if not required:
@@ -349,4 +353,5 @@ class NuScenes(Dataset):
 
 
 def _is_scan(row: Row) -> bool:
+    """Return whether a row of sample_data.json is a key frame of the LiDAR."""
     return bool(row["is_key_frame"]) and str(row["filename"]).startswith(f"samples/{CHANNEL}/")

@@ -24,7 +24,7 @@ from amvnet.errors import InputError, did_you_mean, readable, reason_of, shown
 from amvnet.progress import counted
 from amvnet.scan import Scan
 
-VALIDATING = 10  # the last one of so many scans validates by default
+SCANS_PER_VAL = 10  # of so many scans with labels, the last one validates by default
 
 
 class OwnScans(Dataset):
@@ -51,7 +51,7 @@ class OwnScans(Dataset):
         self._counts: dict[str, int] = {}  # points of the scans that have been read, by name
 
     def parts(self) -> dict[str, tuple[str, ...]]:
-        """Return the sequences of "train", "val" and "test" by the file's split, and of "all"."""
+        """Return the sequences of "train", "val", "test", "rest" (in none of these) and "all"."""
         parts: dict[str, set[str]] = {name: set() for name in (*SPLITS, "all")}
         for record, part in self._listing:
             for name in (part or "rest", "all"):
@@ -60,13 +60,13 @@ class OwnScans(Dataset):
 
     def split(self) -> Split:
         """Return how the file splits the sequences, or how the only sequence with labels is cut."""
-        cut = self._cut
-        note = f"no split: {counted(len(cut), 'scan')} from {cut[0]} on validate" if cut else ""
+        val = self._val_by_default
+        note = f"no split: {counted(len(val), 'scan')} from {val[0]} on validate" if val else ""
         is_given = bool(self.description.split)
         return dataclasses.replace(super().split(), is_given=is_given, note=note)
 
     def lacks(self, split: str) -> str:
-        """Return the error that says which splits the file has, if any."""
+        """Return a message that says which splits the file has, if any."""
         found = f"only {' and '.join(self.description.split)}"
         if not self.description.split:
             labelled = {record.sequence for record, _ in self._listing if record.has_labels}
@@ -99,21 +99,20 @@ class OwnScans(Dataset):
     def labelled(self, records: Sequence[ScanFile]) -> list[ScanFile]:
         """Return the scans that have labels."""
         labelled = [record for record in records if record.labels_path is not None]
+        if labelled or not records:
+            return labelled
 
-        if records and not labelled:
-            place = self.description.labels
-            found = "no labels in the description"
-            if self.description.unread is not None:
-                check_classes(self.spec, self.description.unread, self.taxonomy)
-            if place is not None:
-                found = f"no {self._place_of(records[0].name)}"
-                if len(records) > 1:
-                    found += f", and none for the other {len(records) - 1} scans"
-            raise InputError(
-                f"{self.spec}: expected labelled scans, found {found}; "
-                "correct labels in the file, or name other sequences"
-            )
-        return labelled
+        if self.description.unread is not None:  # labels of other classes
+            check_classes(self.spec, self.description.unread, self.taxonomy)
+        found = "no labels in the description"
+        if self.description.labels is not None:
+            found = f"no {self._label_file(records[0].name)}"
+            if len(records) > 1:
+                found += f", and none for the other {len(records) - 1} scans"
+        raise InputError(
+            f"{self.spec}: expected labelled scans, found {found}; "
+            "correct labels in the file, or name other sequences"
+        )
 
     def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan."""
@@ -138,23 +137,24 @@ class OwnScans(Dataset):
         return read_raw_labels(record.labels_path, count, place.field, layout, missing=missing)
 
     def poses(self, records: Sequence[ScanFile]) -> Poses | None:
-        """Return the poses that the description names; a file has those of all its folder's scans.
+        """Return the poses of the LiDAR in some scans, if the description names a file of poses.
 
-        They belong to the scans in order. If the file has times and another number of poses, they
-        belong to scans whose names are their times.
+        Each folder of scans has such a file, with a pose for each of its scans in their order. If
+        it has times and another number of poses, the names of the scans are their times.
         """
         if not self.description.poses:
             return None
 
-        files = {name: self._poses_file(scan) for name, scan in self._scans.items()}
+        file_of = {name: self._poses_file(scan) for name, scan in self._scans.items()}
         poses: dict[str, Poses] = {}
-        for path in dict.fromkeys(files[record.name] for record in records):
-            names = [name for name in files if files[name] == path]
+        for path in dict.fromkeys(file_of[record.name] for record in records):
+            names = [name for name in file_of if file_of[name] == path]
             times = times_of(Path(name).name for name in names)
             poses |= zip(names, read_poses(path).at(times, len(names)), strict=True)
         return np.array([poses[record.name] for record in records])
 
     def _poses_file(self, scan: ScanFile) -> Path:
+        """Return the file with the poses of the scans in the folder of a scan."""
         return below(scan.path.parent, self.description.poses)
 
     def count_points(self, record: ScanFile) -> int:
@@ -187,10 +187,10 @@ class OwnScans(Dataset):
         place = self.description.labels
         if place is None or place.field is not None:  # labels in a column cannot be replaced alone
             return self.root / record.prediction
-        return self._place_of(record.name)
+        return self._label_file(record.name)
 
-    def _place_of(self, name: str) -> Path:
-        """Return the file that holds the labels of a scan, if the description names any."""
+    def _label_file(self, name: str) -> Path:
+        """Return the file that should hold the labels of a scan; the description has `labels`."""
         scan = self._scans[name]
         assert self.description.labels is not None
         return self.description.labels.path_of(scan.path, scan.name)
@@ -199,7 +199,7 @@ class OwnScans(Dataset):
         """Return the files of a scan, with its poses, and its labels even if they are not read."""
         files = super().files_of(record)
         if self.description.labels is not None:
-            files.append(self._place_of(record.name))
+            files.append(self._label_file(record.name))
         if self.description.poses:
             files.append(self._poses_file(record))
         return files
@@ -207,32 +207,9 @@ class OwnScans(Dataset):
     @cached_property
     def _scans(self) -> dict[str, ScanFile]:
         """The scans in their files, by name: the path from `root`, without the ending."""
-        pattern = self.description.scans
-        try:
-            if ANY_FOLDERS in Path(pattern).parts:  # Python's own does not follow links
-                matches = matching(Path(glob.escape(str(self.root))) / pattern)
-            else:
-                matches = sorted(self.root.glob(pattern))
-        except (ValueError, NotImplementedError, IndexError, OSError) as error:
-            reason = "" if isinstance(error, IndexError) else f" ({reason_of(error)[:160]})"
-            raise InputError(
-                f"{self.spec}: scans: expected a pattern, found {shown(pattern)}{reason}; "
-                "correct it, or root"
-            ) from None
-        paths = [path for path in matches if path.is_file() and not path.name.startswith(".")]
-
-        # Files of labels may also match the pattern of the scans.
-        place = self.description.labels
-        label_paths = set()
-        if place is not None and place.file is not None:
-            label_paths = {place.path_of(path, scan_stem(path)) for path in paths}
-
         scans: dict[str, ScanFile] = {}
         folders: dict[str, Recording] = {}
-        for path in paths:
-            if path in label_paths:
-                continue
-
+        for path in self._scan_paths():
             for scan in list_scans(path, layout=self.description.layout, folders=folders):
                 name = (scan.path.parent.relative_to(self.root) / scan.name).as_posix()
                 if name in scans:
@@ -242,17 +219,44 @@ class OwnScans(Dataset):
                         "scans narrower"
                     )
                 scans[name] = scan
+                folder = Path(name).parent.relative_to(self._fixed)
+                scan.recording.name = (
+                    folder.as_posix() if folder.name else self._fixed.name or "all"
+                )
 
         if not scans:
             raise InputError(
-                f"{self.root}: expected scan files {pattern}, found none; correct scans or root"
+                f"{self.root}: expected scan files {self.description.scans}, found none; correct "
+                "scans or root"
             )
         return scans
 
+    def _scan_paths(self) -> list[Path]:
+        """Return the files that match the pattern of the scans and hold no labels, sorted."""
+        pattern = self.description.scans
+        try:
+            if ANY_FOLDERS in Path(pattern).parts:  # Python's own ** does not follow links
+                matches = matching(Path(glob.escape(str(self.root))) / pattern)
+            else:
+                matches = sorted(self.root.glob(pattern))
+        except (ValueError, NotImplementedError, IndexError, OSError) as error:
+            # Python says nothing that helps of the pattern ".", an IndexError.
+            reason = "" if isinstance(error, IndexError) else f" ({reason_of(error)[:160]})"
+            raise InputError(
+                f"{self.spec}: scans: expected a pattern, found {shown(pattern)}{reason}; "
+                "correct it, or root"
+            ) from None
+        paths = [path for path in matches if path.is_file() and not path.name.startswith(".")]
+
+        place = self.description.labels
+        if place is None or place.file is None:
+            return paths
+        label_paths = {place.path_of(path, scan_stem(path)) for path in paths}
+        return [path for path in paths if path not in label_paths]
+
     @cached_property
     def _listing(self) -> list[tuple[ScanFile, str]]:
-        """The records of all scans, each with its split ("" if it is in none)."""
-        fixed = _fixed_part(self.description.scans)
+        """All scans as the dataset returns them, each with its split ("" if it is in none)."""
         splits = self._splits()
         splits_of_folder: dict[str, set[str]] = {}
         for name, split in splits.items():
@@ -260,8 +264,6 @@ class OwnScans(Dataset):
 
         listing = []
         for name, scan in self._scans.items():
-            place = Path(name).parent.relative_to(fixed).as_posix()
-            scan.recording.name = fixed.name or "all" if place == "." else place
             sequence = self._folder_of(name)
             if len(splits_of_folder[sequence]) > 1:
                 sequence = f"{sequence}-{splits[name] or 'rest'}"
@@ -284,47 +286,58 @@ class OwnScans(Dataset):
         paths = {}
         for name in self._scans:
             if place is not None:
-                path = self._place_of(name)
+                path = self._label_file(name)
                 with readable(f"{self.spec}: labels: {shown(str(path))}"):
                     if path.is_file():
                         paths[name] = path
         return paths
 
     @cached_property
-    def _cut(self) -> list[str]:
-        """The scans that validate by default if a single sequence has labels: its last tenth."""
+    def _val_by_default(self) -> list[str]:
+        """The names of the scans that validate if there is no split and one sequence has labels.
+
+        These are the last tenth of its scans with labels, and the scans among and after them.
+        """
         folders = {self._folder_of(name) for name in self._labels}
         labelled = list(self._labels)
         if self.description.split or len(folders) != 1 or len(labelled) < 2:
             return []
-        first = labelled[-max(len(labelled) // VALIDATING, 1)]
+        first = labelled[-max(len(labelled) // SCANS_PER_VAL, 1)]
         names = [name for name in self._scans if self._folder_of(name) in folders]
         return names[names.index(first) :]
 
+    @cached_property
+    def _fixed(self) -> Path:
+        """The folders at the beginning of the pattern of the scans that have no wildcards."""
+        fixed = Path()
+        for part in Path(self.description.scans).parts[:-1]:
+            if set(part) & WILDCARDS:
+                break
+            fixed /= part
+        return fixed
+
     def _folder_of(self, name: str) -> str:
         """Return the name of the folder that is the sequence of a scan."""
-        fixed = _fixed_part(self.description.scans)
-        parts = Path(name).relative_to(fixed).parts
-        if len(parts) > 1:
-            return parts[0]
-        return fixed.name or "all"
+        parts = Path(name).relative_to(self._fixed).parts
+        return parts[0] if len(parts) > 1 else self._fixed.name or "all"
 
     def _splits(self) -> dict[str, str]:
         """Return the split of each scan by the scan's name; "" if it is in none.
 
         If the file has a split without "train", the scans that it does not name are in "train".
         """
-        if self._cut:
-            folder = self._folder_of(self._cut[0])
-            trained = [name for name in self._scans if self._folder_of(name) == folder]
-            parts = dict.fromkeys(self._scans, "") | dict.fromkeys(trained, "train")
-            return parts | dict.fromkeys(self._cut, "val")
+        val = self._val_by_default
+        if val:
+            folder = self._folder_of(val[0])
+            train = [name for name in self._scans if self._folder_of(name) == folder]
+            in_none = dict.fromkeys(self._scans, "")
+            return in_none | dict.fromkeys(train, "train") | dict.fromkeys(val, "val")
 
         entries = []
         for split, names in self.description.split.items():
             entries += [(split, entry) for entry in names]
-        is_trained_on = self.description.split and "train" not in self.description.split
-        usual = "train" if is_trained_on else ""
+        leaves_out_train = self.description.split and "train" not in self.description.split
+        split_of_rest = "train" if leaves_out_train else ""
 
         splits = {}
         matched = set()
@@ -336,7 +349,7 @@ class OwnScans(Dataset):
                     f"{self.spec}: expected a scan in one split, found {name} in "
                     f"{' and '.join(of_scan)}; correct the split"
                 )
-            splits[name] = of_scan[0] if of_scan else usual
+            splits[name] = of_scan[0] if of_scan else split_of_rest
             matched |= found
 
         for split, entry in entries:
@@ -358,33 +371,24 @@ class OwnScans(Dataset):
         """Return the entries of the split, each with its split, that match a scan."""
         folders = map(Path.as_posix, Path(name).parents)
         file = path.relative_to(self.root).as_posix()
-        texts = {name, file, self._folder_of(name), *folders}
+        names = {name, file, self._folder_of(name), *folders}
 
         found = set()
         for split, entry in entries:
-            if entry in texts or (
+            if entry in names or (
                 set(entry) & WILDCARDS and (fnmatchcase(name, entry) or fnmatchcase(file, entry))
             ):
                 found.add((split, entry))
         return found
 
 
-def _fixed_part(pattern: str) -> Path:
-    """Return the folders at the beginning of a pattern that have no wildcards."""
-    fixed = Path()
-    for part in Path(pattern).parts[:-1]:
-        if set(part) & WILDCARDS:
-            break
-        fixed /= part
-    return fixed
-
-
 def open_own(path: Path | str) -> OwnScans:
     """Open the dataset that a YAML file describes.
 
     Raises:
-        InputError: as `read_description`, or if there is no scan.
+        InputError: as `read_description`, or if there is no scan, two scans have one name, or the
+            split does not fit the scans.
     """
     dataset = OwnScans(read_description(path))
-    dataset.parts()
+    dataset.parts()  # raises now what is wrong with the scans and the split
     return dataset
