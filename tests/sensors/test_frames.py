@@ -10,14 +10,14 @@ import pytest
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.recordings import Recording
 from amvnet.scan import Scan
-from amvnet.sensors.frame import Frame, find_frame
+from amvnet.sensors.frame import Frame, find_frame, median_frame
 from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lidars import AXES, UNKNOWN_SENSOR, Sensor, rotation_from_degrees
 from amvnet.sensors.normalise import Normaliser
 
 from fixtures.commands import fails
 from fixtures.examples import first_of
-from fixtures.sensors import LASERS, place
+from fixtures.sensors import LASERS, between_bent_walls, place
 from fixtures.tiny import fresh_weights, trained_for
 
 UP = ["z-down", "z-forward", "y-up"]
@@ -94,6 +94,28 @@ def test_the_origin_of_a_sensor_that_is_said_to_be_low_is_not_on_the_ground() ->
     assert frame.is_on_ground(Sensor(height=1.0))
     assert not frame.is_on_ground(Sensor(height=0.2))
     assert frame.rises(Sensor(height=0.2), usual_height=1.7) == (0, 0.2 - 1.7)
+
+
+@pytest.mark.parametrize("height", [0.35, 0.55])
+@pytest.mark.parametrize("name", LASERS)
+def test_lasers_tell_a_low_sensor_from_the_foot_of_a_vehicle(name: str, height: float) -> None:
+    low = find_frame(between_bent_walls(LASERS[name], height)[:, :3], Sensor())
+    assert not low.is_on_ground(Sensor())
+
+    seen = between_bent_walls(LASERS[name], 1.73)[:, :3]
+    xyz = seen + np.array([0, 0, 1.73 - height])
+    foot = find_frame(xyz, Sensor())
+    assert foot.height == pytest.approx(height, abs=0.05)
+    assert foot.is_on_ground(Sensor())
+    assert not foot.is_on_ground(Sensor(height=height))
+    assert median_frame([low, foot, foot]).is_on_ground(Sensor())
+
+    expected, _ = normalise(seen)
+    scan, line = normalise(xyz)
+    np.testing.assert_allclose(scan.points, expected.points, atol=0.16)
+    assert "the origin is not the sensor" in line
+    assert "--offset 0,0,-Z if" in line
+    assert "--offset" not in normalise(xyz, Sensor(offset=(0, 0, -1)))[1]
 
 
 @pytest.mark.parametrize("z", [-1.73, 0, 1.73])

@@ -47,7 +47,7 @@ from amvnet.weights.file import load
 from fixtures.marks import with_quick
 from fixtures.processes import PATIENCE
 from fixtures.scan_writers import WRITERS, pcd_bytes, some_points
-from fixtures.sensors import LASERS, on_nuscenes_car, place
+from fixtures.sensors import LASERS, between_bent_walls, on_nuscenes_car, place
 
 NODE = shutil.which("node")
 PAGE = Path(__file__).parents[2] / "web"
@@ -402,6 +402,16 @@ def with_y_up_in_millimetres(folder: Path) -> Case:
     return Case(path)
 
 
+def at_the_foot_of_a_vehicle(folder: Path) -> Case:
+    points = between_bent_walls(LASERS["os1-64"], 1.73)
+    points[:, 2] += 1.33
+    return Case(write_bin(folder / "foot.bin", points))
+
+
+def with_a_low_sensor(folder: Path) -> Case:
+    return Case(write_bin(folder / "low.bin", between_bent_walls(LASERS["os1-64"], 0.4)))
+
+
 def on_the_ground(folder: Path) -> Case:
     points, _ = place(HDL64E, 1.73)
     points[:, 2] += 1.73
@@ -544,6 +554,8 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     without_rings,
     tilted,
     with_y_up_in_millimetres,
+    at_the_foot_of_a_vehicle,
+    with_a_low_sensor,
     on_the_ground,
     on_a_mound,
     on_a_hump,
@@ -723,6 +735,12 @@ NUMBERS: dict[str, dict[str, float]] = {
         "SAME_TILT": frame.SAME_TILT,
         "SAME_HEIGHT": frame.SAME_HEIGHT,
         "LOWEST": frame.ON_GROUND_HEIGHT,
+        "LOW": frame.LOW_HEIGHT,
+        "STANDING": frame.STANDING_HEIGHT,
+        "LESS_SHARP": frame.LESS_SHARP,
+        "SECTORS": lasers.SHARP_SECTORS,
+        "BINS": lasers.SHARP_BINS,
+        "TOGETHER": lasers.BINS_TOGETHER,
         "HIGHEST": frame.MAX_SENSOR_HEIGHT,
     },
     "sensor/ground.js": {

@@ -1,7 +1,7 @@
 // Find the frame of a scan file: its unit, its axes, its tilt, and the height of the sensor.
 
 import { InputError } from "../errors.js";
-import { findGround } from "./ground.js";
+import { findGround, NEAREST } from "./ground.js";
 import { quantilesOf } from "./statistics.js";
 
 // Matrices that turn a file's x, y, z into forward, left, up.
@@ -24,16 +24,23 @@ const AROUND = 0.5;
 const SAME_TILT = 3.5;  // the largest tilt that is kept, degrees; in the datasets, roads slope by up to 3.1
 const SAME_HEIGHT = 0.15;  // the largest difference of height that is kept, metres; the training varies it as much
 const LOWEST = 0.3;  // the least height of a sensor, metres; a lower origin lies on the ground
+// Below this height, the lasers tell whether the origin is a low sensor or the foot of a vehicle.
+const LOW = 0.6;
+const STANDING = 0.3;  // the least height over the ground of points that tell, metres
+const RAISED = Array.from({ length: 13 }, (_, i) => 0.6 + 0.15 * i);  // heights over the origin to seek sensors at, metres
+const LESS_SHARP = 0.75;  // the largest ratio of the sharpness of the lasers from the origin to that from above, if it is apart
+const SECTORS = 60, BINS = 3600, TOGETHER = 20;  // the bins that tell whether points lie on lasers
 const HIGHEST = 4.5;  // the largest height of a sensor on a vehicle, metres; beyond it, the unit may be feet
 
 const degrees = (radians) => (radians * 180) / Math.PI;
 
 /**
- * Return the frame {unit, axes, pitch, roll, height, tilt} of points (3 n), none of them lost. A rotation by pitch and
- * roll, in degrees, levels the scan. The height of the origin over the ground is in metres, or null without a ground.
+ * Return the frame {unit, axes, pitch, roll, height, tilt, isApart} of points (3 n), none of them lost. A rotation by
+ * pitch and roll, in degrees, levels the scan. The height of the origin over the ground is in metres, or null without a
+ * ground; it is apart if the lasers show that it is not the sensor.
  */
 export function findFrame(xyz, name) {
-  const frame = { unit: unitOf(xyz, name), axes: "x-forward", pitch: 0, roll: 0, height: null, tilt: 0 };
+  const frame = { unit: unitOf(xyz, name), axes: "x-forward", pitch: 0, roll: 0, height: null, tilt: 0, isApart: false };
   let level = toLevel(xyz, frame), ground = findGround(level);
   if (!ground) {
     frame.axes = axesOf(level);
@@ -52,6 +59,8 @@ export function findFrame(xyz, name) {
     const up = again ? [0, 1, 2].map((axis) => dot([0, 1, 2].map((row) => turn[row][axis]), again.up)) : ground.up;
     [frame.pitch, frame.roll] = levelling(up);
     frame.height = (again ?? ground).height;
+  } else if (frame.height >= LOWEST && frame.height < LOW) {
+    frame.isApart = isApart(level, ground);
   }
   if (frame.height > HIGHEST) {
     throw new InputError(
@@ -73,7 +82,33 @@ export function toLevel(xyz, { unit, axes, pitch, roll }) {
 
 /** Return whether the origin of the coordinates lies on or below the ground. */
 export function isOnGround(frame) {
-  return frame.height !== null && frame.height < LOWEST;
+  return frame.height !== null && frame.height < (frame.isApart ? LOW : LOWEST);
+}
+
+/** Return whether the lasers of points (3 n) that stand on the ground are clearly sharper from above the origin. */
+function isApart(level, { up, height }) {
+  const isStanding = (i) => dot(level.subarray(i, i + 3), up) + height * up[2] > STANDING;
+  const standing = level.filter((_, place) => isStanding(place - (place % 3)));
+  return sharpnessOf(standing, 0) < LESS_SHARP * Math.max(...RAISED.map((rise) => sharpnessOf(standing, rise)));
+}
+
+/** Return how much points (3 n), seen from a height over the origin, gather at the same elevations, as a laser's do. */
+function sharpnessOf(xyz, rise) {
+  const counts = new Float64Array(SECTORS * BINS);
+  for (let i = 0; i < xyz.length; i += 3) {
+    const radius = Math.hypot(xyz[i], xyz[i + 1]);
+    if (!(radius > NEAREST)) continue;
+    const sector = Math.floor((Math.atan2(xyz[i + 1], xyz[i]) / (2 * Math.PI) + 0.5) * SECTORS) % SECTORS;
+    const bin = Math.floor((degrees(Math.atan2(xyz[i + 2] - rise, radius)) / 180 + 0.5) * BINS);
+    counts[sector * BINS + Math.min(bin, BINS - 1)]++;
+  }
+  let pairs = 0, pairsTogether = 0;
+  for (let i = 0; i < counts.length; i += TOGETHER) {
+    const part = counts.subarray(i, i + TOGETHER), together = part.reduce((sum, count) => sum + count, 0);
+    pairs += part.reduce((sum, count) => sum + count * (count - 1), 0);
+    pairsTogether += together * (together - 1);
+  }
+  return pairs / Math.max(pairsTogether, 1);
 }
 
 /**

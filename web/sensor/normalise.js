@@ -127,9 +127,13 @@ function frameTexts({ unit, axes, pitch, roll, tilt }) {
 function heightText(frame, usualHeight) {
   const { height } = frame;
   if (height === null) return "no ground to measure the height by (give --height; --axes if z is not up)";
-  const text = isOnGround(frame) ? `the ground ${signed(-height, 2)} m from the origin` : `sensor ${height.toFixed(2)} m over the ground`;
-  const [, rise] = risesOf(frame, usualHeight);
-  return rise ? `${text} (moved by ${signed(rise, 2)} m to ${usualHeight.toFixed(2)} m)` : text;
+  const [, rise] = risesOf(frame, usualHeight), notes = rise ? [`moved by ${signed(rise, 2)} m to ${usualHeight.toFixed(2)} m`] : [];
+  let text = `sensor ${height.toFixed(2)} m over the ground`;
+  if (isOnGround(frame)) {
+    text = `the ground at ${signed(-height, 2)} m, so the origin is not the sensor`;
+    notes.push("--offset 0,0,-Z if the sensor is Z m over the origin");
+  }
+  return notes.length ? `${text} (${notes.join("; ")})` : text;
 }
 
 function lasersText({ beams, fov_up: top, fov_down: bottom }) {

@@ -24,7 +24,7 @@ from amvnet.weights.verdict import Verdict
 SHOWN_RECORDINGS = 10  # the most doubtful recordings or scans that are named, each in a line
 # What a user can try if the labels are doubtful.
 ADVICE = (
-    "check what was assumed, and try --height, --axes, --rotate or --intensity-scale, "
+    "check what was assumed, and try --height, --offset, --axes, --rotate or --intensity-scale, "
     "weights of another sensor, or training for yours (docs/own_sensor.md)"
 )
 

@@ -25,6 +25,12 @@ ELEVATION_EDGES = np.linspace(-90, 90, 361)
 SECTORS = 180  # number of sectors of azimuth in which the points of a bin are counted
 SMOOTHED_BINS = 7  # number of neighbouring bins of elevation that are counted together; odd
 
+# Bins that tell whether points lie on lasers: narrower than the spaces between these, but wider
+# than the noise; the sectors are so narrow that a slight tilt changes little within them.
+SHARP_SECTORS = 60  # number of sectors of azimuth
+SHARP_BINS = 3600  # number of bins of elevation
+BINS_TOGETHER = 20  # number of neighbouring bins in which points may lie anywhere
+
 MEASURES = ("beams", "fov_up", "fov_down", "height")  # the attributes of a SensorGeometry
 
 
@@ -152,6 +158,22 @@ def laser_density(points: np.ndarray) -> NDArray[np.float64]:
     inside = (ELEVATION_EDGES[1:] > down) & (ELEVATION_EDGES[:-1] < up)
     within: NDArray[np.float64] = np.where(inside, density, 0.0)
     return within
+
+
+def laser_sharpness(xyz: NDArray[np.float64]) -> float:
+    """Return how much the points (N, 3) gather at the same elevations, as those of a laser do.
+
+    This is the share of pairs of points in one bin among the pairs in neighbouring bins. It is
+    largest from where the sensor was: seen from elsewhere, the points of a laser spread.
+    """
+    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > MIN_DISTANCE]
+    sector = ((np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) + 0.5) * SHARP_SECTORS).astype(int)
+    elevation = ((elevations(xyz) / 180 + 0.5) * SHARP_BINS).astype(int)
+    cell = sector % SHARP_SECTORS * SHARP_BINS + np.minimum(elevation, SHARP_BINS - 1)
+    counts = np.bincount(cell, minlength=SHARP_SECTORS * SHARP_BINS).reshape(-1, BINS_TOGETHER)
+    together = counts.sum(axis=1)
+    pairs = (together * (together - 1)).sum()
+    return float((counts * (counts - 1)).sum() / max(pairs, 1))
 
 
 def rows_by_density(

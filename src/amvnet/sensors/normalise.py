@@ -358,11 +358,13 @@ def _describe_height(frame: Frame, sensor: Sensor, usual_height: float | None) -
     if height is None:
         return "no ground to measure the height by (give --height; --axes if z is not up)"
 
-    if frame.is_on_ground(sensor):
-        text = f"the ground {-(frame.height or 0):+.2f} m from the origin"
-    else:
-        text = f"sensor {height:.2f} m over the ground"
+    text = f"sensor {height:.2f} m over the ground"
+    notes = []
     _, rise = frame.rises(sensor, usual_height)
     if rise:
-        text += f" (moved by {rise:+.2f} m to {usual_height:.2f} m)"
-    return text
+        notes.append(f"moved by {rise:+.2f} m to {usual_height:.2f} m")
+    if frame.is_on_ground(sensor):
+        text = f"the ground at {-(frame.height or 0):+.2f} m, so the origin is not the sensor"
+        if sensor.offset is None:
+            notes.append("--offset 0,0,-Z if the sensor is Z m over the origin")
+    return f"{text} ({'; '.join(notes)})" if notes else text
