@@ -17,7 +17,7 @@ from amvnet.errors import InputError
 Reader = type[SemanticKitti] | type[NuScenes]
 
 READERS: dict[str, Reader] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
-DEEPEST = 3  # the scans of SemanticKITTI are in a folder this far below the dataset's
+DEEPEST = 3  # number of folders from a dataset down to its deepest: sequences/08/velodyne
 OWN = "files"  # prefix of the YAML file of a user's own scans
 # Prefixes of simulated streets, each with the name of its sensor.
 SIMULATED = {f"simulated-{sensor}": sensor for sensor in CLASSES_BY_SENSOR}
@@ -43,10 +43,10 @@ def open_dataset(spec: str, classes: Taxonomy | None = None) -> Dataset:
 
 
 def with_classes(dataset: Dataset, classes: Taxonomy) -> Dataset:
-    """Return a dataset with some classes, as `open_dataset` opens it.
+    """Return a dataset with the given classes, as `open_dataset(spec, classes)` opens it.
 
     Raises:
-        InputError: if the dataset has other classes.
+        InputError: if the dataset is a benchmark with other classes.
     """
     if dataset.taxonomy.classes == classes.classes:
         return dataset
@@ -58,17 +58,19 @@ def with_classes(dataset: Dataset, classes: Taxonomy) -> Dataset:
 
 def is_dataset(spec: str) -> bool:
     """Return whether a text names a dataset, by its prefix or by the layout of its folder."""
-    path, version = _split_version(spec)
-    kind = spec.partition(":")[0]
-    if kind in READERS or kind in SIMULATED or _is_own(spec) or version is not None:
+    if spec.partition(":")[0] in (*READERS, *SIMULATED) or _is_own(spec):
         return True
-    return path.is_dir() and bool(_readers_of(path))
+    path, version = _split_version(spec)
+    return version is not None or (path.is_dir() and bool(_readers_of(path)))
 
 
 def undescribed(spec: str) -> Path | None:
-    """Return the folder that a text names if no layout and no YAML file says what is in it."""
+    """Return the folder that a text names if no layout and no YAML file says what is in it.
+
+    Return None if the text names no folder, or `open_dataset` knows what to name instead.
+    """
     path = Path(os.path.expanduser(spec))
-    if not path.is_dir() or is_dataset(spec) or _did_you_mean_file(path) or _place_for(path):
+    if not path.is_dir() or is_dataset(spec) or _did_you_mean_file(path) or _advice_for(path):
         return None
     return path
 
@@ -102,11 +104,12 @@ def _open(spec: str) -> Dataset:
 
 
 def _is_own(spec: str) -> bool:
+    """Return whether a text names the description of a user's own scans."""
     return spec.partition(":")[0] == OWN or is_description(spec)
 
 
 def _did_you_mean_file(path: Path) -> str:
-    """Return the end of a message, the YAML file of this name and an ending, if there is one."""
+    """Return the end of a message that asks for the YAML file of a folder; "" if there is none."""
     for ending in ENDINGS:
         file = f"{path}{ending}"
         if is_description(file):
@@ -123,6 +126,7 @@ def _split_version(text: str) -> tuple[Path, str | None]:
 
 
 def _readers_of(path: Path) -> list[Reader]:
+    """Return the readers whose layout a folder has."""
     return [reader for reader in READERS.values() if reader.matches(path)]
 
 
@@ -131,22 +135,21 @@ def _guess_reader(path: Path) -> Reader:
     readers = _readers_of(path)
     if len(readers) == 1:
         return readers[0]
+    expected = "either sequences/XX/velodyne (SemanticKITTI) or v1.0-*/sample_data.json (nuScenes)"
     if readers:
-        found = "both; write " + " or ".join(f"{kind}:PATH" for kind in READERS)
-    else:
-        advice = _place_for(path) or f"`amvnet check {path}` begins a YAML file that describes it"
-        found = f"neither{_did_you_mean_file(path) or f'; {advice}'}"
+        kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
+        raise InputError(f"{path}: expected {expected}, found both; write {kinds}")
+    advice = _advice_for(path) or f"`amvnet check {path}` begins a YAML file that describes it"
     raise InputError(
-        f"{path}: expected either sequences/XX/velodyne (SemanticKITTI) or v1.0-*/sample_data.json "
-        f"(nuScenes), found {found}"
+        f"{path}: expected {expected}, found neither{_did_you_mean_file(path) or f'; {advice}'}"
     )
 
 
-def _place_for(path: Path) -> str:
+def _advice_for(path: Path) -> str:
     """Return what to give instead of a folder that has the layout of no dataset; "" if unknown."""
     folder = path.absolute()
     for parent in folder.parents[:DEEPEST]:
-        # `matches` is not enough: a dataset in the parent may lie next to this unrelated folder.
+        # That the parent is a dataset is not enough: this folder may lie beside the dataset's own.
         if any(reader.holds(parent, folder) for reader in READERS.values()):
             return f"give the folder of the whole dataset, {parent}"
     described = [file for file in sorted(path.iterdir()) if file.suffix.lower() in ENDINGS]
