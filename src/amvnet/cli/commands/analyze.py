@@ -58,25 +58,33 @@ def analyze(
     from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
     from amvnet.training.plan import Plan
 
-    has_values = neighbours is not None or taus is not None
-    if has_values != (recipe is not None):
+    is_sweep = neighbours is not None or taus is not None
+    if is_sweep != (recipe is not None):
         raise InputError(
             "expected --neighbours or --taus together with --recipe, found only one of them; "
             "give both or neither"
         )
     weights, loaded, dataset = load_dataset(data, weights)
     records = choice.records(dataset)
+    model = loaded.model
+    by_count = {count: with_neighbours(model, count) for count in sorted(set(neighbours or ()))}
+    by_tau = {tau: with_tau(model, tau) for tau in sorted(set(taus or ()))}
+    # The name of an option, of its axis, the value in the weights, and a model for each new value.
+    sweeps = (
+        ("neighbours", "neighbours", model.point_head.neighbours, by_count),
+        ("taus", "tau", model.assertion.threshold, by_tau),
+    )
 
     # Check the outputs and the training scans first: scoring takes long, and would be for nothing
     # if a head could not be trained or a file could not be written.
-    swept = [name for name, values in {"neighbours": neighbours, "taus": taus}.items() if values]
+    swept = [option for option, _, _, models in sweeps if models]
     outputs = charts.files_of(out, (*charts.FIGURES, *swept), charts.TABLES)
     check_outputs(outputs, [data, weights, recipe], overwrite)
     plan = None
     if recipe is not None:
         train = dataset.labelled(choose_records(dataset, train_sequences, "train"))
-        taught = TrainingData([Source(dataset, train, records)])
-        plan = Plan(load_recipe(recipe), taught, out, stage="head", resume=True, report=report)
+        scans = TrainingData([Source(dataset, train, records)])
+        plan = Plan(load_recipe(recipe), scans, out, stage="head", resume=True, report=report)
 
     segmenter = load_segmenter(loaded, "amvnet", compute)
     make_folder(out)
@@ -85,15 +93,6 @@ def analyze(
     written = charts.write_all(analysis, data, out)
 
     if plan is not None:
-        model = loaded.model
-        by_count = {count: with_neighbours(model, count) for count in sorted(set(neighbours or ()))}
-        by_tau = {tau: with_tau(model, tau) for tau in sorted(set(taus or ()))}
-        # Each sweep has the name of its option, the name of its axis, the value in the given
-        # weights, and a model for each value to train a head for.
-        sweeps = (
-            ("neighbours", "neighbours", model.point_head.neighbours, by_count),
-            ("taus", "tau", model.assertion.threshold, by_tau),
-        )
         for option, axis, value_in_weights, models in sweeps:
             if models:
                 sweep_plan = replace(plan, out=out / option)

@@ -65,19 +65,22 @@ def map(
     outputs = {out: SIGNATURES[out.suffix]}
     if json is not None:
         outputs[json] = FIGURES
+
     sensor, options = sensor_choice.parse(), choice.parse()
     found = find_inputs([inputs], options)
     weights, loaded = load_for(found, weights, sensor)
     scans, _ = found.scans(loaded.taxonomy, Normaliser(loaded.expects, sensor, report))
     files = [path for scan in scans for path in scan.files]
     request = LabelChoice().parse(loaded, choice, sensor_choice, resolved(compute))
-    hidden = digest(out.name)  # short, so that each name of a map has room for it
-    with alone_in(out.parent, f".{hidden}.lock"):
+
+    # The files beside a map have a digest in their names: with its name, names could be too long.
+    beside = f".{digest(out.name)}"
+    with alone_in(out.parent, f"{beside}.lock"):
         check_outputs(outputs, [*files, weights, poses], overwrite)
         with progress("poses") as step:
             drives = find_poses(scans, poses, progress=step, report=report, is_one=True)
-        name = f"{request.digest_of(scans, drives)}, {voxel:g} m"
-        saved = SavedMap(out.with_name(f".{hidden}.unfinished.npz"), name, resume)
+        made_from = f"{request.digest_of(scans, drives)}, {voxel:g} m"  # changes if voxels would
+        saved = SavedMap(out.with_name(f"{beside}.unfinished.npz"), made_from, resume)
         builder = MapBuilder(voxel, loaded.taxonomy)
         segmenter = load_segmenter(loaded, request.method, compute)
         with progress("mapping") as step:
@@ -88,6 +91,7 @@ def map(
         figures = describe_map(world, len(scans))
         if json is not None:
             write_json(json, figures)
+
     largest = sorted(figures["classes"].items(), key=lambda item: -item[1])[:SHOWN_CLASSES]
     shares = ", ".join(f"{count / max(len(world), 1):.0%} {name}" for name, count in largest)
     report(

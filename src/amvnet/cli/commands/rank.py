@@ -36,10 +36,10 @@ def rank(
     from amvnet.files import make_folder
     from amvnet.outputs import check_outputs
 
-    # Check this before any scan is scored, so that no time is wasted.
+    # Check the output before any scan is scored, so that no time is wasted.
     check_outputs({out: TABLE}, [data, weights], overwrite)
     make_folder(out.parent)
-    weights, loaded, dataset = load_dataset(data, weights)
+    _, loaded, dataset = load_dataset(data, weights)
     records = choice.records(dataset, "all")
     segmenter = load_segmenter(loaded, "ensemble", compute)
 

@@ -58,8 +58,9 @@ def train(
     from amvnet.weights.file import load
 
     if not resume:
+        # Refuse a folder with another run now, because reading all scans takes long.
         for name in recipe.stages if stage == "all" else (stage,):
-            RunFolder(out).stages[name].check_begun()  # before the scans are measured
+            RunFolder(out).stages[name].check_begun()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     plan = Plan.open(
         recipe,
@@ -75,14 +76,14 @@ def train(
         scores=models.parse(),
         also_read=(*data, init),
     )
-    for other in plan.data.sources[1:]:
+    for other in plan.data.sources[1:]:  # `choose` has reported on the first one
         report_unused(other, f"{other.dataset.spec}: ")
-    train, val = describe_records(plan.data.train), describe_records(plan.data.val)
-    report(f"training on {train}; validating on {val}")
+    trained_on = describe_records(plan.data.train)
+    report(f"training on {trained_on}; validating on {describe_records(plan.data.val)}")
 
-    path = train_stages(plan)
-    line = f"weights in {path}"
-    parts = load(path).parts
+    trained = train_stages(plan)
+    line = f"weights in {trained}"
+    parts = load(trained).parts
     if stage != "head" and set(BOTH_NETWORKS) <= set(parts) and "point_head" not in parts:
         line += "; they have no point head yet: train it by the same command with --stage head"
     report(line)

@@ -61,7 +61,7 @@ def view(
             "leave it out"
         )
     sensor = sensor_choice.parse()
-    # Check this before any scan is segmented, so that no time is wasted.
+    # Check the page's place before any scan is segmented, so that no time is wasted.
     if html is not None:
         html = page_name(html)
         check_outputs({html: PAGE}, [*inputs, labels, weights, sensor_choice.sensor], overwrite)
@@ -76,13 +76,13 @@ def view(
         classes = loaded.taxonomy
         normaliser = Normaliser(loaded.expects, sensor, report)
 
-    listed, classes = found.scans(classes, normaliser)
+    found_scans, classes = found.scans(classes, normaliser)
     if labels is not None:
-        check_labels(labels, len(listed))
+        check_labels(labels, len(found_scans))
     segmenter = None
     if loaded is not None:
         segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
-    chosen = evenly_spaced(listed, scans)
+    chosen = evenly_spaced(found_scans, scans)
     with place_for_page(html) as page, progress("looking") as step:
         shown = show_scans(chosen, segmenter, labels, progress=step)
         write_page(page, shown, classes, _title(inputs, weights))
@@ -92,6 +92,7 @@ def view(
 
 
 def _title(inputs: list[str], weights: str | None) -> str:
+    """Return the title of a page: the name of the first input, and of the weights if any label."""
     title = Path(inputs[0]).resolve().name
     if len(inputs) > 1:
         title += f" and {len(inputs) - 1} more"
