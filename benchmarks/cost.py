@@ -11,7 +11,6 @@ coarse map (`models/upsampled_conv.py`).
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from unittest.mock import patch
 
 import torch
@@ -37,11 +36,11 @@ def convolve_upsampled(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor
     return output
 
 
-def gmac(forward: Callable[[], object]) -> float:
+def gmac(network: nn.Module, view: object) -> float:
     """Return the billions of multiply-adds of a forward pass."""
     # With gradients: the operations of oneDNN that torch calls without them are not counted.
     with FlopCounterMode(display=False) as counter:
-        forward()
+        network(view)
     return counter.get_total_flops() / 2e9  # the counter counts a multiply-add as two operations
 
 
@@ -58,12 +57,12 @@ def add_rows(table: Table, name: str) -> None:
     image, grid = model.project(PointBatch.of([prepared]))
     for title, net, view in (("RV", model.range_net, image.image), ("BEV", model.polar_net, grid)):
         millions = sum(parameter.numel() for parameter in net.parameters()) / 1e6
-        computed = gmac(lambda net=net, view=view: net(view))
+        computed = gmac(net, view)
         with (
             patch("amvnet.models.range_net.apply_to_joined", convolve_upsampled),
             patch("amvnet.models.polar_net.apply_to_joined", convolve_upsampled),
         ):
-            defined = gmac(lambda net=net, view=view: net(view))
+            defined = gmac(net, view)
         table.add_row(name, title, f"{millions:.2f}", f"{defined:.0f}", f"{computed:.0f}")
 
 

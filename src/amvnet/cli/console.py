@@ -22,8 +22,8 @@ from amvnet.fleet.secrets import without_secrets
 from amvnet.progress import Progress, Tenths
 
 LONGEST_LINE = 5000  # longest line that is printed in full, characters
-FEW = 10  # smallest number of things that are alike enough for their pace to tell the time left
 MAX_LINES = 2000  # largest number of lines that are printed of one text
+LEAST_FOR_PACE = 10  # of fewer things, one that takes long decides the pace, which then misleads
 
 
 class SafeStream:
@@ -45,25 +45,25 @@ class SafeStream:
         """Write a text. Characters that the stream cannot encode are escaped."""
         stream = self._stream
         encoding = getattr(stream, "encoding", None) or "utf-8"
-        with self._losing():
+        with self._never_failing():
             stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
 
     def flush(self) -> None:
         """Write the text in the buffer."""
-        with self._losing():
+        with self._never_failing():
             self._stream.flush()
 
     @contextmanager
-    def _losing(self) -> Iterator[None]:
-        """Drop this and all later output if the stream is closed or its disk is full."""
+    def _never_failing(self) -> Iterator[None]:
+        """Lose this and all later output if the stream is closed or its disk is full."""
         try:
             yield
         except (OSError, ValueError, AttributeError) as error:  # after >&- the stream is None
+            # What libraries write to the stream must not fail either.
             with suppress(OSError, ValueError, AttributeError), open(os.devnull, "w") as nothing:
                 os.dup2(nothing.fileno(), self._stream.fileno())
-            if not isinstance(error, OSError) or error.errno == errno.EPIPE:
-                return  # the stream is closed, or a reader such as head has read enough
-            if self.name == "stdout":
+            # A closed stream is no fault: the user closed it, or a reader such as head has enough.
+            if self.name == "stdout" and isinstance(error, OSError) and error.errno != errno.EPIPE:
                 report_fault(f"stdout cannot be written ({error.strerror}); the work goes on")
 
 
@@ -87,7 +87,7 @@ def report_lines(text: str) -> None:
 
 
 def show(table: RenderableType) -> None:
-    """Print a table, without styles."""
+    """Print a table without styles, line by line as `report` prints lines."""
     plain = Console(
         file=stdout,  # type: ignore[arg-type]
         width=console.width,
@@ -114,16 +114,10 @@ def printable(text: str) -> str:
     text = without_secrets(text)
     if len(text) > LONGEST_LINE:
         text = f"{text[:LONGEST_LINE]}... ({len(text):,} characters)"
-    if text.isprintable():
-        return text
-
-    escaped = ""
-    for character in text:
-        if character.isprintable():
-            escaped += character
-        else:
-            escaped += character.encode("unicode_escape").decode("ascii")
-    return escaped
+    return "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
+        for character in text
+    )
 
 
 def silence() -> None:
@@ -165,8 +159,10 @@ class ProgressLines:
     def __call__(self, done: int, total: int) -> None:
         """Report the progress if another tenth of the work is done."""
         if self.tenths.ends(done, total):
-            pace = self._pace(done, total, time.monotonic() - self.start)
-            report(f"{self.title}: {done} of {total}{pace if total >= FEW else ''}")
+            line = f"{self.title}: {done} of {total}"
+            if total >= LEAST_FOR_PACE:
+                line += self._pace(done, total, time.monotonic() - self.start)
+            report(line)
 
     def _pace(self, done: int, total: int, elapsed: float) -> str:
         """Return the rate and the time left after some seconds: ", 2.1 a second, 0:01:16 left"."""
