@@ -30,7 +30,7 @@ from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import NUSCENES, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import alone_in, atomic_write, remove_unfinished
-from amvnet.inference.pipeline import OutputOptions, Pipeline, check_output
+from amvnet.inference.pipeline import LabelFiles, OutputOptions, Pipeline, check_output
 from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
 from amvnet.weights.file import save
@@ -58,7 +58,7 @@ def label(inputs: Sequence[ScanFile], scans: Sequence[Scan]) -> list[Segmentatio
 def write(
     base: Path, scans: Sequence[ScanFile], kind: str = "label", written: Taxonomy | None = None
 ) -> None:
-    output = OutputOptions(base / "out", kind, written, scores=True, uncertain=True, overwrite=True)
+    output = OutputOptions(base / "out", LabelFiles(kind, True, True), written, overwrite=True)
     check_output(scans, output)
     Pipeline(scans, label, output).run({})
 
@@ -158,7 +158,7 @@ def test_scans_among_the_outputs_are_not_changed(
         scans: list[ScanFile] = []
         for name in ("a", "b", "c/a"):
             scans.append(named(name, paths[len(scans) % len(paths)]))
-        output = OutputOptions(out, kind, scores=True, uncertain=True, overwrite=overwrite)
+        output = OutputOptions(out, LabelFiles(kind, True, True), overwrite=overwrite)
         with suppress(InputError):
             check_output(scans, output)
             Pipeline(scans, label, output).run({})

@@ -22,6 +22,7 @@ from amvnet.files import alone_in, digest
 from amvnet.inference import map as mapping
 from amvnet.inference.drive import Drives
 from amvnet.inference.listing import list_inputs
+from amvnet.inference.reading import Reading
 from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
@@ -253,7 +254,7 @@ def test_a_map_is_not_resumed_if_anything_is_other_that_its_scores_depend_on(
         replace(request, precision="bfloat16").digest_of(scans, drives),
         replace(request, engine="onnx").digest_of(scans, drives),
         replace(request, engine="int8").digest_of(scans, drives),
-        replace(request, sensor=Sensor(keep_own=True)).digest_of(scans, drives),
+        replace(request, reading=Reading(Sensor(keep_own=True))).digest_of(scans, drives),
         replace(request, weights=fresh_weights(seed=1)).digest_of(scans, drives),
     ]
     status = scans[4].path.stat()

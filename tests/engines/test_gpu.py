@@ -520,7 +520,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
         "precision": "float32",
         "tau": segmenter.engine.tau,
         "sensor": repr(Sensor()),
-        "layout": repr(ScanOptions().layout),
+        "layout": repr(ScanOptions().reading.layout),
         "scores": False,
         "uncertain": False,
         "format": "label",

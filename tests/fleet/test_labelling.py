@@ -24,7 +24,7 @@ from amvnet.fleet.labelling import IS_FATAL, LabelScans, MeasureSensors, statist
 from amvnet.fleet.manifest import list_scans
 from amvnet.fleet.results import Results, results_schema
 from amvnet.fleet.storage import Place
-from amvnet.inference.pipeline import Segment
+from amvnet.inference.pipeline import LabelFiles, Segment
 from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation
@@ -92,7 +92,7 @@ def test_the_labels_come_last_into_a_bucket(
         write(place, content)
 
     monkeypatch.setattr(Place, "write", record)
-    request = replace(labelling, scores=True, uncertain=True)
+    request = replace(labelling, files=LabelFiles(scores=True, uncertain=True))
     label(request, "s3://fleet/last", [f"{fleet}/scans/drive1/000000.bin"])
     assert len(written) == 3
     assert written[-1] == "000000.label"
@@ -172,7 +172,7 @@ def test_a_scan_in_the_output_folder_is_not_replaced(
     path = tmp_path / "a.ply"
     write_ply(path, points)
     before = path.read_bytes()
-    worker = LabelScans(replace(labelling, kind="ply"), str(tmp_path))
+    worker = LabelScans(replace(labelling, files=LabelFiles("ply")), str(tmp_path))
     (row,) = worker(pa.table({"path": [str(path)]})).to_pylist()
     assert "expected an input outside the output folder" in row["error"]
     assert path.read_bytes() == before
@@ -239,7 +239,7 @@ def test_names_in_a_manifest_write_nothing_elsewhere(
 
     with surroundings(link, make=make) as base:
         out = str(base / "out")
-        request = replace(labelling, kind=kind, scores=True, uncertain=True)
+        request = replace(labelling, files=LabelFiles(kind, True, True))
         row = {
             "path": f"{base}/data/a.bin",
             "name": name.replace("BASE", str(base)),

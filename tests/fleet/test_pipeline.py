@@ -320,8 +320,8 @@ def scans_of(drive: str, *names: str) -> pa.Table:
     return pa.Table.from_pylist(rows)
 
 
-def run_in(fleet: Path, folder: Path, **options: bool) -> FleetRun:
-    request = LabellingRequest(load(fleet / "w.safetensors"), **options)  # type: ignore[arg-type]
+def run_in(fleet: Path, folder: Path) -> FleetRun:
+    request = LabellingRequest(load(fleet / "w.safetensors"))
     results = Results(Place.of(str(folder)), request)
     return FleetRun(request, results, Cluster(workers=1), {"num_cpus": 1})
 

@@ -12,11 +12,12 @@ import pytest
 import amvnet
 from amvnet.data.formats import find
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
-from amvnet.inference.listing import find_inputs
+from amvnet.inference.listing import ScanOptions, find_inputs
+from amvnet.inference.reading import Reading
 from amvnet.sensors import measure
 from amvnet.sensors.built_in import lasers_of, weights_for
 from amvnet.sensors.lasers import SensorGeometry
-from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, Sensor, make_sensor
+from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, make_sensor
 
 from fixtures.commands import fails, files, succeed
 from fixtures.datasets import make_nuscenes, make_semantickitti
@@ -79,41 +80,42 @@ def test_the_lasers_of_the_first_recording_choose(
         (tmp_path / folder).mkdir()
         write(tmp_path / folder / "scan.npy", laser, height)
     inputs = find_inputs([f"{tmp_path}/a", f"{tmp_path}/b"])
-    assert inputs.choose_weights(Sensor())[0] == name
+    assert inputs.choose_weights()[0] == name
 
 
 def test_a_described_sensor_chooses_whatever_the_points_show(tmp_path: Path) -> None:
     path = str(write(tmp_path / "scan.npy", "vlp16"))
     for sensor, name in (("hdl32e", "sim-hdl32e"), ("hdl64e", "sim-hdl64e"), ("os1-64", LAST)):
-        assert find_inputs([path]).choose_weights(make_sensor(sensor))[0] == name
+        options = ScanOptions(reading=Reading(make_sensor(sensor)))
+        assert find_inputs([path], options).choose_weights()[0] == name
 
 
 def test_the_classes_of_a_dataset_choose(tmp_path: Path) -> None:
     for make, name in ((make_semantickitti, "sim-hdl64e"), (make_nuscenes, "sim-hdl32e")):
         root = tmp_path / name
         make(root)
-        assert find_inputs([str(root)]).choose_weights(Sensor())[0] == name
+        assert find_inputs([str(root)]).choose_weights()[0] == name
 
 
 def test_the_yaml_file_of_own_scans_describes_the_sensor_that_chooses(tmp_path: Path) -> None:
     write(tmp_path / "scan.npy", "vlp16")
     path = tmp_path / "own.yaml"
     path.write_text("scans: '*.npy'\nclasses: {car: 1}\nsensor: hdl32e\n")
-    assert find_inputs([str(path)]).choose_weights(Sensor())[0] == "sim-hdl32e"
+    assert find_inputs([str(path)]).choose_weights()[0] == "sim-hdl32e"
     path.write_text("scans: '*.npy'\nclasses: {car: 1}\n")
-    assert find_inputs([str(path)]).choose_weights(Sensor())[0] == LAST
+    assert find_inputs([str(path)]).choose_weights()[0] == LAST
 
 
 def test_scans_that_cannot_be_read_choose_as_unknown_lasers(tmp_path: Path) -> None:
     (tmp_path / "scan.bin").write_bytes(b"123")
-    choice = find_inputs([str(tmp_path)]).choose_weights(Sensor())
+    choice = find_inputs([str(tmp_path)]).choose_weights()
     assert choice == (LAST, "as the lasers are unknown")
 
 
 def test_scans_of_several_sensors_in_a_folder_choose_no_lasers(tmp_path: Path) -> None:
     for index, sensor in enumerate(("vlp16", "hdl32e", "os1-64")):
         write(tmp_path / f"{index}.npy", sensor)
-    choice = find_inputs([str(tmp_path)]).choose_weights(Sensor())
+    choice = find_inputs([str(tmp_path)]).choose_weights()
     assert choice == (LAST, "as the scans are of several sensors")
 
 

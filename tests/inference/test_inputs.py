@@ -18,6 +18,7 @@ from amvnet.data.formats import find
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
+from amvnet.data.formats.rows import parse_layout
 from amvnet.data.recordings import Recording
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
@@ -309,7 +310,7 @@ TRAINED = TrainedIntensity(tuple(np.linspace(0.1, 0.9, len(PROBABILITIES)).tolis
 def test_an_array_is_taken_with_any_columns(array: np.ndarray, columns: str | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        scan = array_scan(array_cloud(array, columns))
+        scan = array_scan(array_cloud(array, parse_layout(columns)))
     np.testing.assert_array_equal(scan.points, POINTS)
     has_ring = array.shape[1] == 5
     np.testing.assert_array_equal(scan.ring, RING if has_ring else None)
@@ -344,7 +345,7 @@ def test_an_array_without_intensity_gets_those_that_the_weights_need_and_a_warni
 def test_an_array_of_another_shape_is_refused(
     array: np.ndarray, columns: str | None, word: str
 ) -> None:
-    fails(lambda: array_cloud(array, columns), "expected", word)
+    fails(lambda: array_cloud(array, parse_layout(columns)), "expected", word)
 
 
 def test_inputs_of_different_classes_are_refused(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from amvnet.data.class_maps import class_map
 from amvnet.data.formats.rows import parse_layout
+from amvnet.inference.pipeline import LabelFiles
 from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.lidars import Sensor
 
@@ -22,23 +23,31 @@ OTHERS: dict[str, Any] = {
     "tau": 0.5,
     "precision": "bfloat16",
     "engine": "int8",
-    "sensor": Sensor(height=2.0),
-    "layout": parse_layout("x,y,z,ring", "float64"),
-    "topic": "/points",
     "classes": class_map("coarse"),
-    "kind": "ply",
-    "scores": True,
-    "uncertain": True,
     "drive": "0123456789abcdef",
+}
+# The fields of its own values.
+OTHERS_OF: dict[str, dict[str, Any]] = {
+    "reading": {
+        "sensor": Sensor(height=2.0),
+        "layout": parse_layout("x,y,z,ring", "float64"),
+        "topic": "/points",
+    },
+    "files": {"kind": "ply", "scores": True, "uncertain": True},
 }
 
 
 def test_each_field_changes_the_settings() -> None:
     request = LabellingRequest(fresh_weights())
-    assert set(OTHERS) == {field.name for field in fields(request)}
-    for name, value in OTHERS.items():
-        other = replace(request, **{name: value})
-        assert other.settings != request.settings, name
+    assert {*OTHERS, *OTHERS_OF} == {field.name for field in fields(request)}
+    others = [replace(request, **{name: value}) for name, value in OTHERS.items()]
+    for part, changes in OTHERS_OF.items():
+        whole = getattr(request, part)
+        assert set(changes) == {field.name for field in fields(whole)}
+        for name, value in changes.items():
+            others.append(replace(request, **{part: replace(whole, **{name: value})}))
+    for other in others:
+        assert other.settings != request.settings, other
         assert json.loads(json.dumps(other.settings)) == other.settings
 
 
@@ -56,9 +65,9 @@ def test_a_request_that_does_not_fit_is_refused_in_one_line() -> None:
         if not name.startswith("point_head")
     }
     incomplete = replace(request.weights, tensors=without_head)
-    fails(lambda: replace(request, kind="mcap"), "mcap")
+    fails(lambda: LabelFiles("mcap"), "mcap")
     fails(lambda: replace(request, tau=2.0), "tau")
     fails(lambda: replace(request, tau=float(np.nan)), "tau")
-    fails(lambda: replace(request, method="rv", uncertain=True), "--uncertain")
+    fails(lambda: replace(request, method="rv", files=LabelFiles(uncertain=True)), "--uncertain")
     fails(lambda: replace(request, method="rv", tau=0.3), "--tau")
     fails(lambda: LabellingRequest(incomplete), "point_head")

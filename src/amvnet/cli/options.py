@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from amvnet.data.recordings import ScanFile
     from amvnet.inference.drive import DriveOptions
     from amvnet.inference.listing import Inputs, ScanOptions
+    from amvnet.inference.reading import Reading
     from amvnet.inference.request import LabellingRequest
     from amvnet.inference.scores import ScorePair
     from amvnet.inference.segmenter import Segmenter
@@ -53,17 +54,19 @@ class ScanChoice:
     """the type of the numbers in .bin files, with --columns: float32, float64, ..., or a type for
     each column, separated by commas; default: float32."""
 
-    def parse(self) -> ScanOptions:
-        """Return the options as `list_inputs` takes them.
+    def parse(self, sensor: SensorChoice | None = None) -> ScanOptions:
+        """Return the options as `find_inputs` takes them.
 
         Raises:
-            InputError: if a value cannot be parsed.
+            InputError: if a value cannot be parsed; or as `SensorChoice.parse`.
         """
         from amvnet.data.formats.rows import parse_layout
         from amvnet.inference.listing import ScanOptions
+        from amvnet.inference.reading import Reading
 
         layout = parse_layout(self.columns, self.dtype)
-        return ScanOptions(self.sequences, self.split, topic=self.topic, layout=layout)
+        described = UNKNOWN_SENSOR if sensor is None else sensor.parse()
+        return ScanOptions(self.sequences, self.split, Reading(described, layout, self.topic))
 
 
 @dataclass(frozen=True)
@@ -215,15 +218,14 @@ class LabelChoice:
     uncertain: bool = False
     """also write NAME.uncertain.npy, which marks the points on which the two networks disagree."""
 
-    def parse(
-        self, weights: Weights, choice: ScanChoice, sensor_choice: SensorChoice, compute: Compute
-    ) -> LabellingRequest:
+    def parse(self, weights: Weights, reading: Reading, compute: Compute) -> LabellingRequest:
         """Return the request for labels by some weights.
 
         Raises:
             InputError: if a value cannot be parsed, or does not fit the weights.
         """
         from amvnet.data.class_maps import class_map
+        from amvnet.inference.pipeline import LabelFiles
         from amvnet.inference.request import LabellingRequest
 
         return LabellingRequest(
@@ -232,13 +234,9 @@ class LabelChoice:
             self.tau,
             precision=compute.precision,
             engine=compute.engine,
-            sensor=sensor_choice.parse(),
-            layout=choice.parse().layout,
-            topic=choice.topic,
+            reading=reading,
             classes=None if self.classes is None else class_map(self.classes),
-            kind=self.format,
-            scores=self.scores,
-            uncertain=self.uncertain,
+            files=LabelFiles(self.format, self.scores, self.uncertain),
         )
 
 
@@ -316,16 +314,26 @@ def given_options(choice: Any) -> list[str]:
     return words
 
 
-def load_for(
-    inputs: Inputs, weights: str, sensor: Sensor = UNKNOWN_SENSOR, then: str = ""
-) -> tuple[str, Weights]:
+def open_inputs(
+    inputs: Sequence[str], choice: ScanChoice, sensor: SensorChoice, weights: str, then: str = ""
+) -> tuple[Inputs, str, Weights]:
+    """Return the inputs that a user names, and the name of weights for them with the weights.
+
+    The errors and the other arguments are those of `find_inputs` and `load_for`.
+    """
+    from amvnet.inference.listing import find_inputs
+
+    found = find_inputs(inputs, choice.parse(sensor))
+    return found, *load_for(found, weights, then)
+
+
+def load_for(inputs: Inputs, weights: str, then: str = "") -> tuple[str, Weights]:
     """Return the name of the weights for some inputs, and the weights.
 
     If `weights` is "auto", the first recording of the inputs chooses among the built-in weights,
     and a line reports which are chosen and why.
 
     Args:
-        sensor: what is known about the sensor of scan files.
         then: the end of that line.
 
     Raises:
@@ -334,7 +342,7 @@ def load_for(
     from amvnet.weights.file import load, unfinished_stages
 
     if weights == AUTO:
-        weights, reason = inputs.choose_weights(sensor)
+        weights, reason = inputs.choose_weights()
         report(f"weights {weights}, {reason}{then}")
     loaded = load(weights)
     stages = unfinished_stages(weights)

@@ -33,15 +33,15 @@ from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, 
 from amvnet.fleet.secrets import without_secrets
 from amvnet.fleet.storage import Place
 from amvnet.inference.drive import Broken, Outcome
-from amvnet.inference.listing import Inputs
+from amvnet.inference.listing import Inputs, ScanOptions
 from amvnet.inference.loading import load_with
 from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
+from amvnet.inference.reading import Reading
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation
 from amvnet.runtime.memory import keep_freed_memory
-from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normalised, Normaliser
 
 TRANSFERS = 8  # number of files that are fetched from object storage at the same time
@@ -115,12 +115,12 @@ class LabelScans:
             check_outside(Place.of(row["path"]), self._out)
 
         request = self.request
-        with _fetch(drive, request.layout) as (files, folder):
+        with _fetch(drive, request.reading.layout) as (files, folder):
             known = None
             if drive[0]["estimates"]:
                 (recording,) = files.recordings()
                 known = (recording, parse_estimate(drive[0]["estimates"]))
-            normaliser = Normaliser(request.weights.expects, request.sensor, known=known)
+            normaliser = Normaliser(request.weights.expects, request.reading.sensor, known=known)
             files = files.with_classes(request.weights.taxonomy)
             scans = files.normalised_by(normaliser).records()
             pipeline = Pipeline(
@@ -144,7 +144,7 @@ class LabelScans:
             line = str(outcome.error).replace(str(scan.path), _shown_path(row))
             return self._row(row, error=line)
 
-        paths = list(pipeline.output.files_of(scan))
+        paths = list(pipeline.output.files.of(scan))
         try:
             entry = pipeline.write(outcome)
             if self._out.local is None:
@@ -193,8 +193,8 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     assumed = ""
     usual = None
     # A scan that cannot be read is reported as broken when it is labelled.
-    normaliser = Normaliser(request.weights.expects, request.sensor)
-    with suppress(Exception), _fetch(drive, request.layout) as (files, _):
+    normaliser = Normaliser(request.weights.expects, request.reading.sensor)
+    with suppress(Exception), _fetch(drive, request.reading.layout) as (files, _):
         files = files.normalised_by(normaliser)
         (recording,) = files.recordings()
         assert isinstance(recording, Normalised)
@@ -206,10 +206,10 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
     return describe_drive(drive[0]["drive"], assumed, usual)
 
 
-def choose_weights(drive: Sequence[Row], sensor: Sensor, layout: RowLayout) -> tuple[str, str]:
+def choose_weights(drive: Sequence[Row], reading: Reading) -> tuple[str, str]:
     """Return the name of built-in weights for a drive, and why, as `Inputs.choose_weights`."""
-    with _fetch(drive, layout) as (scans, _):
-        return Inputs([scans]).choose_weights(sensor)
+    with _fetch(drive, reading.layout) as (scans, _):
+        return Inputs([scans], ScanOptions(reading=reading)).choose_weights()
 
 
 @contextmanager

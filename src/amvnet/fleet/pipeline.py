@@ -20,7 +20,6 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from amvnet.data.formats.rows import RowLayout
 from amvnet.engines.compute import Compute
 from amvnet.engines.precision import choose_precision
 from amvnet.errors import InputError, reason_of
@@ -32,9 +31,9 @@ from amvnet.fleet.storage import Place
 from amvnet.inference.journal import Entry
 from amvnet.inference.pipeline import check_faults
 from amvnet.inference.predict import report_certainty
+from amvnet.inference.reading import Reading
 from amvnet.inference.request import LabellingRequest
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
-from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.measure import MEASURED_SCANS
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
@@ -120,9 +119,7 @@ def label_fleet(
     return run.finish()
 
 
-def choose_weights(
-    inputs: Sequence[str], out: str, sensor: Sensor, layout: RowLayout
-) -> tuple[str, str]:
+def choose_weights(inputs: Sequence[str], out: str, reading: Reading) -> tuple[str, str]:
     """Return the name of the built-in weights for the first drive, and in words why these.
 
     Raises:
@@ -130,7 +127,7 @@ def choose_weights(
     """
     table = next(list_scans(inputs, Place.of(out)))
     drive = table.filter(pc.equal(table["drive"], table["drive"][0]))
-    return choose_for_drive(drive.slice(0, MEASURED_SCANS).to_pylist(), sensor, layout)
+    return choose_for_drive(drive.slice(0, MEASURED_SCANS).to_pylist(), reading)
 
 
 def _windows(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:
@@ -169,7 +166,7 @@ class FleetRun:
     def plan(self, window: pa.Table) -> pa.Table:
         """Return the scans that are not done; raise InputError if two would write the same file."""
         names = window["name"].to_pylist()
-        for ending in self.request.endings:
+        for ending in self.request.files.endings:
             is_new = self._paths.add([f"{name}{ending}" for name in names])
             if not is_new.all():
                 raise InputError(

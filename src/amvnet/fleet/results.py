@@ -92,7 +92,7 @@ class Results:
         self.done = NameSet()
         self.estimates: dict[str, str] = {}
         self._schema = results_schema(request.taxonomy)
-        self._endings = request.endings
+        self._endings = request.files.endings
         self._pending: list[pa.Table] = []
         self._last = time.monotonic()  # the time at which the last part was written
         self._number = 0  # the number of the next part

@@ -5,9 +5,8 @@ from __future__ import annotations
 from amvnet.data.spacing import evenly_spaced
 from amvnet.engines.export.int8 import MAX_SCANS, SIMULATED, simulated_scans
 from amvnet.errors import InputError
-from amvnet.inference.listing import list_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.scan import Scan
-from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import Weights
 
 
@@ -24,10 +23,8 @@ def calibration_scans(text: str, weights: Weights) -> list[Scan]:
     if text == SIMULATED:
         return simulated_scans(weights)
 
-    normaliser = Normaliser(weights.expects)
-    inputs, _ = list_inputs([text], taxonomy=weights.taxonomy, normaliser=normaliser)
     scans = []
-    for scan_input in evenly_spaced(inputs, MAX_SCANS):
+    for scan_input in evenly_spaced(find_inputs([text]).for_weights(weights), MAX_SCANS):
         scan = scan_input.load()
         if scan.valid.any():
             scans.append(weights.expects.prepare(scan))

@@ -10,8 +10,8 @@ from amvnet.data.datasets.files import ScanFiles
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.recordings import Recording, ScanFile
 from amvnet.errors import InputError
-from amvnet.inference.listing import Inputs
-from amvnet.inference.reading import array_cloud
+from amvnet.inference.listing import Inputs, ScanOptions
+from amvnet.inference.reading import Reading, array_cloud
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Reporter
 from amvnet.scan import AnyArray, Scan
@@ -26,7 +26,8 @@ def choose_by(cloud: Cloud, sensor: Sensor) -> tuple[str, str]:
     """Return the name of built-in weights for a scan in memory, and why, as `Inputs` does."""
     recording = Recording("scan")
     recording.scans.append(ScanFile("scan", recording, Path("scan"), read=lambda: cloud))
-    return Inputs([ScanFiles(recording.scans)]).choose_weights(sensor)
+    inputs = Inputs([ScanFiles(recording.scans)], ScanOptions(reading=Reading(sensor)))
+    return inputs.choose_weights()
 
 
 class ChoosingSegmenter(Segmenter):
@@ -34,10 +35,14 @@ class ChoosingSegmenter(Segmenter):
 
     Args:
         make: returns the segmenter with the weights of a name.
+        reading: as `Segmenter` takes it.
         report: called with a line that says which weights are chosen, and why.
     """
 
-    def __init__(self, make: Callable[[str], Segmenter], report: Reporter) -> None:
+    def __init__(
+        self, make: Callable[[str], Segmenter], reading: Reading, report: Reporter
+    ) -> None:
+        self.reading = reading
         self._make = make
         self._report = report
         self._choice = ""  # the line that is reported
@@ -58,7 +63,7 @@ class ChoosingSegmenter(Segmenter):
 
     def _list(self, inputs: Inputs) -> list[ScanFile]:
         if not self._choice:
-            self._take(*inputs.choose_weights(self.sensor))
+            self._take(*inputs.choose_weights())
         return super()._list(inputs)
 
     def _read_array(
@@ -68,7 +73,7 @@ class ChoosingSegmenter(Segmenter):
             if isinstance(points, Scan):
                 cloud = Cloud(points.points[:, :3], points.points[:, 3], points.ring)
             else:
-                cloud = array_cloud(points, columns or self.columns)
+                cloud = array_cloud(points, self.reading.by(columns).layout)
             self._take(*self._choose_by(cloud))
         return super()._read_array(points, columns)
 
@@ -78,9 +83,9 @@ class ChoosingSegmenter(Segmenter):
         Unless the sensor is described, such points are not normalised: without rings, the networks
         would not know the lasers.
         """
-        if cloud.ring is None and not self.sensor.is_known:
+        if cloud.ring is None and not self.reading.sensor.is_known:
             return weights_for(SensorGeometry())
-        return choose_by(cloud, self.sensor)
+        return choose_by(cloud, self.reading.sensor)
 
     def _take(self, name: str, reason: str) -> None:
         """Take the weights of a name."""

@@ -13,17 +13,19 @@ from amvnet.data.datasets.base import Dataset, choose_records
 from amvnet.data.datasets.files import ScanFiles
 from amvnet.data.datasets.open import is_dataset, open_dataset, with_classes
 from amvnet.data.formats.find import list_scans
-from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.recordings import Recording, ScanFile, by_recording, name_apart
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.inference.reading import AS_FOUND, Reading
+from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.built_in import lasers_of, weights_for
 from amvnet.sensors.lasers import SensorGeometry
-from amvnet.sensors.lidars import KNOWN_HEIGHTS, Sensor
+from amvnet.sensors.lidars import KNOWN_HEIGHTS
 from amvnet.sensors.measure import MEASURED_SCANS, Estimate, Measured
 from amvnet.sensors.normalise import Normaliser, described_sensor, normalised
 from amvnet.sensors.own_body import mark_own
+from amvnet.weights.file import Weights
 
 MEASURED_HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # of a sensor whose scans lie on the ground, metres
 
@@ -34,14 +36,12 @@ class ScanOptions:
 
     Attributes:
         sequences: the sequences or scenes to use of datasets; by default the sequences of `split`.
-        topic: the topic to read in bags; by default the only one with scans.
-        layout: the names of the columns in files that do not name them.
+        reading: how files and bags are read.
     """
 
     sequences: Sequence[str] | None = None
     split: str = "all"
-    topic: str | None = None
-    layout: RowLayout = UNKNOWN
+    reading: Reading = AS_FOUND
 
 
 class Inputs:
@@ -51,18 +51,17 @@ class Inputs:
     """
 
     def __init__(self, parts: Sequence[Dataset], options: ScanOptions = ScanOptions()) -> None:
+        self.reading = options.reading
         self._parts = parts
         self._options = options
         self._known: tuple[Recording, Estimate | None] | None = None  # what chose the weights
 
-    def choose_weights(self, sensor: Sensor) -> tuple[str, str]:
+    def choose_weights(self) -> tuple[str, str]:
         """Return the name of built-in weights for the first recording, and in words why these.
 
         This reads and measures the first scans; `scans` does not repeat it.
-
-        Args:
-            sensor: what is known about the sensor of scan files.
         """
+        sensor = self.reading.sensor
         part = self._parts[0]
         classes = None if isinstance(part, ScanFiles) else part.taxonomy
         recordings = part.recordings()
@@ -79,6 +78,13 @@ class Inputs:
             self._known = (recordings[0], usual)
         lasers = SensorGeometry() if usual is None else usual.lasers
         return weights_for(lasers.override(sensor), classes, measured.is_mixed)
+
+    def for_weights(
+        self, weights: Weights, report: Reporter = report_nothing, official: bool = False
+    ) -> list[ScanFile]:
+        """Return all scans, normalised to weights; the arguments and errors are as for `scans`."""
+        normaliser = Normaliser(weights.expects, self.reading.sensor, report)
+        return self.scans(weights.taxonomy, normaliser, official)[0]
 
     def scans(
         self,
@@ -141,6 +147,7 @@ def find_inputs(specs: Sequence[str], options: ScanOptions = ScanOptions()) -> I
     Raises:
         InputError: if an input is missing or has no scan.
     """
+    reading = options.reading
     parts: list[Dataset] = []
     folders: dict[str, Recording] = {}
     is_alone = len(specs) == 1
@@ -148,7 +155,7 @@ def find_inputs(specs: Sequence[str], options: ScanOptions = ScanOptions()) -> I
         if is_dataset(spec):
             parts.append(open_dataset(spec))
         else:
-            found = list_scans(spec, options.topic, options.layout, is_alone, folders)
+            found = list_scans(spec, reading.topic, reading.layout, is_alone, folders)
             parts.append(ScanFiles(list(found)))
     return Inputs(parts, options)
 
@@ -228,5 +235,5 @@ def read_all(path: Path | str, topic: str | None = None) -> Scans:
     Raises:
         InputError: if there is no scan.
     """
-    scans, _ = list_inputs([str(path)], ScanOptions(topic=topic))
+    scans, _ = list_inputs([str(path)], ScanOptions(reading=Reading(topic=topic)))
     return Scans(path, scans)

@@ -15,6 +15,7 @@ from amvnet.engines.onnx import OnnxEngine
 from amvnet.engines.precision import resolved
 from amvnet.engines.torch import TorchEngine
 from amvnet.inference.choosing import ChoosingSegmenter
+from amvnet.inference.reading import AS_FOUND, Reading
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method
@@ -79,24 +80,21 @@ def load(
             be simulated for int8.
     """
     described = make_sensor(sensor, height=height, keep_own=keep_own or None)
-    parse_layout(columns)  # before the networks are loaded, which takes long
+    reading = Reading(described, parse_layout(columns))
     compute = Compute(device, engine, precision)
 
     def load_named(weights: Weights | Path | str) -> Segmenter:
-        return load_with(compute, weights, method, tau, graphs=graphs, report=report)
+        return load_with(
+            compute, weights, method, tau, reading=reading, graphs=graphs, report=report
+        )
 
-    segmenter: Segmenter
-    if weights == AUTO:
-        compute = resolved(compute)  # what can be checked before the first scan
-        check_method(method, PARTS)
-        if tau is not None:
-            Disagreement(tau)
-        segmenter = ChoosingSegmenter(load_named, report)
-    else:
-        segmenter = load_named(weights)
-    segmenter.sensor = described
-    segmenter.columns = columns
-    return segmenter
+    if weights != AUTO:
+        return load_named(weights)
+    compute = resolved(compute)  # what can be checked before the first scan
+    check_method(method, PARTS)
+    if tau is not None:
+        Disagreement(tau)
+    return ChoosingSegmenter(load_named, reading, report)
 
 
 def load_with(
@@ -105,6 +103,7 @@ def load_with(
     method: MethodName,
     tau: float | None = None,
     *,
+    reading: Reading = AS_FOUND,
     graphs: bool = True,
     report: Reporter = report_nothing,
 ) -> Segmenter:
@@ -122,6 +121,6 @@ def load_with(
         networks = cached_networks(loaded, is_int8, report)
         made = OnnxEngine(loaded, networks, method, tau, int8=is_int8)
 
-    segmenter = Segmenter(loaded, made, compute.at_once)
+    segmenter = Segmenter(loaded, made, reading, compute.at_once)
     report(f"computing on {made.hardware} in {made.precision}")
     return segmenter

@@ -16,7 +16,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from amvnet.data.formats.registry import COLUMN_READERS
-from amvnet.data.labels.writers import SCORES, SIGNATURES, UNCERTAIN, write_uncertain
+from amvnet.data.labels.writers import (
+    SCORES,
+    SIGNATURES,
+    UNCERTAIN,
+    check_kind,
+    write_uncertain,
+)
 from amvnet.data.recordings import ScanFile, by_recording
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken, memory_for
@@ -34,32 +40,36 @@ UNCERTAIN_ENDING = ".uncertain.npy"
 
 
 @dataclass(frozen=True)
-class OutputOptions:
-    """The choice of files that are written for each scan.
+class LabelFiles:
+    """The files that are written for each scan.
 
     Attributes:
         kind: the format of the labels of scan files, one of `writers.KINDS`; datasets have their
             own format.
-        taxonomy: the classes of the labels; by default the classes of the dataset.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.
         uncertain: also write which points are uncertain, (N,) bool, as `.uncertain.npy`.
-        resume: leave out the scans that an earlier run into the same folder has done.
-        also_read: other files that the command reads, which must not be replaced; what names no
-            file is ignored.
+
+    Raises:
+        InputError: if the format is unknown.
     """
 
-    folder: Path
     kind: str = "label"
-    taxonomy: Taxonomy | None = None
     scores: bool = False
     uncertain: bool = False
-    overwrite: bool = False
-    resume: bool = False
-    also_read: Sequence[Path | str | None] = ()
 
-    def files_of(self, scan: ScanFile) -> dict[Path, Signature]:
-        """Return the files that are written for a scan, by the path relative to the folder."""
+    def __post_init__(self) -> None:
+        check_kind(self.kind)
+
+    @property
+    def endings(self) -> tuple[str, ...]:
+        """The endings of the files of a scan file; the label file is first."""
+        scores = (".npz",) if self.scores else ()
+        uncertain = (UNCERTAIN_ENDING,) if self.uncertain else ()
+        return (f".{self.kind}", *scores, *uncertain)
+
+    def of(self, scan: ScanFile) -> dict[Path, Signature]:
+        """Return the files of a scan, by the path relative to the folder of the labels."""
         labels = scan.dataset.place_of_prediction(scan, self.kind)
         ending = labels.suffix or f".{self.kind}"  # a name such as ".label" has no suffix
         files = {labels: SIGNATURES[ending]}
@@ -68,6 +78,29 @@ class OutputOptions:
         if self.uncertain:
             files[scan.scores_path.with_suffix(UNCERTAIN_ENDING)] = UNCERTAIN
         return files
+
+
+LABELS = LabelFiles()
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Where the files of the scans are written, and what they replace.
+
+    Attributes:
+        files: which files are written.
+        taxonomy: the classes of the labels; by default the classes of the dataset.
+        resume: leave out the scans that an earlier run into the same folder has done.
+        also_read: other files that the command reads, which must not be replaced; what names no
+            file is ignored.
+    """
+
+    folder: Path
+    files: LabelFiles = LABELS
+    taxonomy: Taxonomy | None = None
+    overwrite: bool = False
+    resume: bool = False
+    also_read: Sequence[Path | str | None] = ()
 
 
 # A function that segments scans in memory, given the inputs that they were read from. It raises
@@ -167,7 +200,7 @@ class Pipeline:
         The scan has not changed, nor have the first scans of its recording and what a description
         says of them, which decide how it is normalised.
         """
-        paths = [self.output.folder / path for path in self.output.files_of(scan)]
+        paths = [self.output.folder / path for path in self.output.files.of(scan)]
         return entry.origin == self._origins[entry.scan] and all(map(Path.is_file, paths))
 
     @cached_property
@@ -260,9 +293,9 @@ class Pipeline:
         scan, loaded, result = labelled.scan, labelled.loaded, labelled.result
         output = self.output
         scores_path = inside(output.folder, scan.scores_path)
-        if output.scores:
+        if output.files.scores:
             write_scores(scores_path, result)
-        if output.uncertain:
+        if output.files.uncertain:
             write_uncertain(scores_path.with_suffix(UNCERTAIN_ENDING), result.uncertain)
 
         scan.dataset.write_labels(
@@ -271,7 +304,7 @@ class Pipeline:
             loaded,
             result.labels,
             taxonomy=output.taxonomy,
-            kind=output.kind,
+            kind=output.files.kind,
             uncertain=result.uncertain if result.has_two_networks else None,
         )
 
@@ -334,7 +367,7 @@ def check_output(scans: Sequence[ScanFile], output: OutputOptions) -> None:
     new_files: dict[Path, Signature] = {}
     for scan in scans:
         inputs += scan.files
-        for path, signature in output.files_of(scan).items():
+        for path, signature in output.files.of(scan).items():
             if output.resume and _key(scan) in earlier:
                 own_files.append(inside(folder, path))
             else:
@@ -361,8 +394,8 @@ def _check_names(scans: Sequence[ScanFile]) -> None:
 
 def _check_folder(scan: ScanFile, output: OutputOptions) -> None:
     """Raise InputError if output files would lie among the scans and look like scans."""
-    labels_look_like_scans = f".{output.kind}" in COLUMN_READERS
-    scores_look_like_scans = output.scores and scan.path.suffix.lower() == ".npz"
+    labels_look_like_scans = f".{output.files.kind}" in COLUMN_READERS
+    scores_look_like_scans = output.files.scores and scan.path.suffix.lower() == ".npz"
     folder = (output.folder / scan.scores_path).parent
     is_own_folder = folder.resolve() == scan.path.parent.resolve()
     if is_own_folder and (labels_look_like_scans or scores_look_like_scans):

@@ -18,7 +18,6 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Reporter, TitledProgress, report_nothing
 from amvnet.scan import Scan
-from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.verdict import Verdict
 
 SHOWN_RECORDINGS = 10  # the most doubtful recordings or scans that are named, each in a line
@@ -60,8 +59,7 @@ def predict(
             raises it.
     """
     classes = request.classes
-    normaliser = Normaliser(request.weights.expects, request.sensor, report)
-    scans, _ = inputs.scans(request.weights.taxonomy, normaliser, official=True)
+    scans = inputs.for_weights(request.weights, report, official=True)
     check_output(scans, output)
     drives = None
     if drive is not None:

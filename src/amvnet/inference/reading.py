@@ -1,24 +1,48 @@
-"""Read arrays of points as scans."""
+"""How scans are read from files and arrays."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from amvnet.data.formats.cloud import Cloud, require_columns
-from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
+from amvnet.data.formats.rows import UNKNOWN, RowLayout, name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
 from amvnet.scan import AnyArray, Scan, as_array, check_scan
 from amvnet.sensors.frame import check_metres
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler
+from amvnet.sensors.lidars import UNKNOWN_SENSOR, Sensor
 
 # Largest number of columns of an array of points; an array with more columns is taken for a
 # transposed one.
 MAX_COLUMNS = 64
 EXPECTED = "points of shape (N, 3 or more) with columns x, y, z, intensity"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How files and arrays of points are read.
+
+    Attributes:
+        sensor: what is known about the sensor; the rest is measured.
+        layout: the names of the columns in files that do not name them.
+        topic: the topic to read in bags; by default the only one with scans.
+    """
+
+    sensor: Sensor = UNKNOWN_SENSOR
+    layout: RowLayout = UNKNOWN
+    topic: str | None = None
+
+    def by(self, columns: str | Sequence[str] | None) -> Reading:
+        """Return how they are read if someone names the columns; None changes nothing."""
+        return replace(self, layout=parse_layout(columns)) if columns else self
+
+
+AS_FOUND = Reading()
 
 
 def checked_scan(points: AnyArray | Scan, trained: TrainedIntensity | None = None) -> Scan:
@@ -32,21 +56,21 @@ def checked_scan(points: AnyArray | Scan, trained: TrainedIntensity | None = Non
     return array_scan(array_cloud(points), trained)
 
 
-def array_cloud(points: AnyArray, columns: str | Sequence[str] | None = None) -> Cloud:
+def array_cloud(points: AnyArray, layout: RowLayout = UNKNOWN) -> Cloud:
     """Return the points of an array as those of a scan file.
 
     Args:
         points: (N, 3 or more) x, y, z in metres, intensity in [0, 1], ring; or an array of any
             shape with fields of these names, in any order, such as `read_points` of ROS returns.
             Anything that `as_array` takes may stand for an array.
-        columns: the names of the columns in order, as a list or separated by commas. Only x, y, z,
-            intensity and ring are used. By default, named fields keep their names; other columns
-            are x, y, z and intensity, followed by the ring if the values suggest it.
+        layout: the names of the columns in order. Only x, y, z, intensity and ring are used. By
+            default, named fields keep their names; other columns are x, y, z and intensity,
+            followed by the ring if the values suggest it.
 
     Raises:
         InputError: if the shape is another one, or names of columns are missing.
     """
-    names = parse_layout(columns).columns
+    names = layout.columns
     with errors_of("scan"):
         _check_no_path(points)
         array = as_array(points, EXPECTED)

@@ -9,17 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.labels.writers import check_kind
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.compute import EngineName, Precision
 from amvnet.files import digest, size_and_time
 from amvnet.inference.drive import Drives
-from amvnet.inference.pipeline import UNCERTAIN_ENDING, OutputOptions
+from amvnet.inference.pipeline import LABELS, LabelFiles, OutputOptions
+from amvnet.inference.reading import AS_FOUND, Reading
 from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method, check_two_networks
-from amvnet.sensors.lidars import UNKNOWN_SENSOR, Sensor
 from amvnet.weights.file import Weights
 
 
@@ -29,14 +27,16 @@ class LabellingRequest:
 
     Attributes:
         method, tau, precision: as `amvnet.load` takes them.
+        reading: how scan files are read.
         classes: maps the classes of the weights to the classes that are written. By default, the
             classes of the weights are written.
+        files: which files are written for each scan.
         drive: the digest of the poses by which scores are fused over time; None if they are not.
 
     Raises:
         InputError: if the weights lack a part that the method needs, the method has no uncertain
-            points to choose by `tau` or to write, the format is unknown, `classes` names no class
-            of the weights, or `tau` is out of range.
+            points to choose by `tau` or to write, `classes` names no class of the weights, or `tau`
+            is out of range.
     """
 
     weights: Weights
@@ -44,22 +44,17 @@ class LabellingRequest:
     tau: float | None = None
     precision: Precision = "auto"
     engine: EngineName = "torch"
-    sensor: Sensor = UNKNOWN_SENSOR
-    layout: RowLayout = UNKNOWN
-    topic: str | None = None
+    reading: Reading = AS_FOUND
     classes: ClassMap | None = None
-    kind: str = "label"
-    scores: bool = False
-    uncertain: bool = False
+    files: LabelFiles = LABELS
     drive: str | None = None
 
     def __post_init__(self) -> None:
-        check_kind(self.kind)
         check_method(self.method, self.weights.parts)
         if self.tau is not None:
             Disagreement(self.tau)
             check_two_networks(self.method, "--tau")
-        if self.uncertain:
+        if self.files.uncertain:
             check_two_networks(self.method, "--uncertain")
         if self.classes is not None:
             self.classes.table(self.weights.taxonomy)
@@ -68,16 +63,6 @@ class LabellingRequest:
     def taxonomy(self) -> Taxonomy:
         """The classes that are written."""
         return self.weights.taxonomy if self.classes is None else self.classes.target
-
-    @property
-    def endings(self) -> tuple[str, ...]:
-        """The endings of the files that are written for each scan file; the label file is first."""
-        endings = [f".{self.kind}"]
-        if self.scores:
-            endings.append(".npz")
-        if self.uncertain:
-            endings.append(UNCERTAIN_ENDING)
-        return tuple(endings)
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -89,13 +74,13 @@ class LabellingRequest:
             # All other engines give equal labels.
             "engine": "int8" if self.engine == "int8" else None,
             "tau": self.tau,
-            "sensor": repr(self.sensor),
-            "topic": self.topic,
-            "layout": repr(self.layout),
+            "sensor": repr(self.reading.sensor),
+            "topic": self.reading.topic,
+            "layout": repr(self.reading.layout),
             "classes": None if self.classes is None else repr(self.classes),
-            "scores": self.scores,
-            "uncertain": self.uncertain,
-            "format": self.kind,
+            "scores": self.files.scores,
+            "uncertain": self.files.uncertain,
+            "format": self.files.kind,
             "drive": self.drive,
         }
 
@@ -117,13 +102,5 @@ class LabellingRequest:
         also_read: Sequence[Path | str | None] = (),
     ) -> OutputOptions:
         """Return which files are written for each scan, and into which folder."""
-        return OutputOptions(
-            folder,
-            self.kind,
-            None if self.classes is None else self.classes.target,
-            scores=self.scores,
-            uncertain=self.uncertain,
-            overwrite=overwrite,
-            resume=resume,
-            also_read=also_read,
-        )
+        written = None if self.classes is None else self.classes.target
+        return OutputOptions(folder, self.files, written, overwrite, resume, also_read)

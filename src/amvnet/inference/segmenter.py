@@ -8,20 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from amvnet.data.datasets.open import is_dataset
-from amvnet.data.formats.rows import parse_layout
 from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
 from amvnet.inference.listing import Inputs, ScanOptions, find_inputs
-from amvnet.inference.reading import array_cloud, array_scan
+from amvnet.inference.reading import AS_FOUND, Reading, array_cloud, array_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.memory import return_freed_memory
 from amvnet.scan import AnyArray, Scan, check_scan, turned
-from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
 from amvnet.sensors.own_body import mark_own
 from amvnet.weights.file import Weights
@@ -37,22 +35,26 @@ class Segmenter:
     Args:
         weights: trained weights.
         engine: scores points by the networks of these weights.
+        reading: how arrays and files are read. If nothing is known about the sensor, files are
+            normalised by what they show, and arrays are taken as they are.
         at_once: the number of scans to segment at the same time, each with its share of torch's
             threads; by default the number that the engine suggests.
 
     Attributes:
-        weights, engine, at_once: as above.
-        sensor: what is known about the sensor of arrays and files. If nothing is known, files are
-            normalised by what they show, and arrays are taken as they are.
-        columns: the names of the columns of arrays and files, as `__call__` takes them.
+        weights, engine, reading, at_once: as above.
     """
 
-    def __init__(self, weights: Weights, engine: Engine, at_once: int | None = None) -> None:
+    def __init__(
+        self,
+        weights: Weights,
+        engine: Engine,
+        reading: Reading = AS_FOUND,
+        at_once: int | None = None,
+    ) -> None:
         self.weights = weights
         self.engine = engine
+        self.reading = reading
         self.at_once = engine.at_once if at_once is None else at_once
-        self.sensor = Sensor()
-        self.columns: str | Sequence[str] | None = None
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -126,8 +128,8 @@ class Segmenter:
                 f"{points}: expected one scan, found a dataset; segment its scans with "
                 "Segmenter.each"
             )
-        layout = parse_layout(columns or self.columns)
-        scans = self._list(find_inputs([str(points)], ScanOptions(layout=layout)))
+        options = ScanOptions(reading=self.reading.by(columns))
+        scans = self._list(find_inputs([str(points)], options))
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
@@ -154,11 +156,12 @@ class Segmenter:
         """Return the scan of an array, normalised to the weights if its sensor is described."""
         if isinstance(points, Scan):
             return check_scan(points)
-        cloud = array_cloud(points, columns or self.columns)
-        if self.sensor.is_known:
-            return self._normaliser()(Recording("scan")).to_scan(cloud)
-        scan = array_scan(cloud, self.weights.expects.intensity)
-        return mark_own(scan, self.sensor)
+        expects = self.weights.expects
+        sensor = self.reading.sensor
+        cloud = array_cloud(points, self.reading.by(columns).layout)
+        if sensor.is_known:
+            return Normaliser(expects, sensor)(Recording("scan")).to_scan(cloud)
+        return mark_own(array_scan(cloud, expects.intensity), sensor)
 
     def _segment(self, scans: Sequence[Scan], yaws: Sequence[float] | None) -> list[Segmentation]:
         """Segment scans, each with a valid point, in one pass."""
@@ -193,17 +196,14 @@ class Segmenter:
             InputError: if there is no scan. The iterator raises it if a scan cannot be read or
                 segmented.
         """
-        options = ScanOptions(topic=topic, layout=parse_layout(self.columns))
+        options = ScanOptions(reading=replace(self.reading, topic=topic))
         paths = [path] if isinstance(path, Path | str) else path
         inputs = find_inputs(list(map(str, paths)), options)
         return map(self._segment_input, self._list(inputs))
 
     def _list(self, inputs: Inputs) -> list[ScanFile]:
         """Return the scans of some inputs, normalised to the weights when they are read."""
-        return inputs.scans(self.taxonomy, self._normaliser())[0]
-
-    def _normaliser(self) -> Normaliser:
-        return Normaliser(self.weights.expects, self.sensor)
+        return inputs.for_weights(self.weights)
 
     def _segment_input(self, scan: ScanFile, yaw: float = 0.0) -> Segmentation:
         """Read and segment a scan."""

@@ -12,8 +12,8 @@ from amvnet.cli.options import (
     LabelledChoice,
     ScanChoice,
     SensorChoice,
-    load_for,
     load_segmenter,
+    open_inputs,
 )
 from amvnet.config.bounds import Count, Seed, Share
 from amvnet.engines.compute import Compute
@@ -73,9 +73,7 @@ def adapt(
     from amvnet.data.datasets.training_data import Source, TrainingData
     from amvnet.engines.precision import resolved
     from amvnet.inference.drive import find_poses
-    from amvnet.inference.listing import find_inputs
     from amvnet.models.methods import check_method
-    from amvnet.sensors.normalise import Normaliser
     from amvnet.training.adapt import adapt as adapt_weights
     from amvnet.training.adapt import recipe_for
     from amvnet.training.plan import Plan
@@ -84,12 +82,10 @@ def adapt(
         raise InputError("--poses: expected no --loose, whose scans are no drive; leave one out")
     if val_sequences and not val:
         raise InputError("--val-sequences: expected --val, found none; add it")
-    sensor, options = sensor_choice.parse(), choice.parse()
-    found = find_inputs(inputs, options)
-    weights, loaded = load_for(found, weights, sensor)
+    found, weights, loaded = open_inputs(inputs, choice, sensor_choice, weights)
     check_method("amvnet", loaded.parts)
-    scans, _ = found.scans(loaded.taxonomy, Normaliser(loaded.expects, sensor, report))
-    request = LabelChoice().parse(loaded, choice, sensor_choice, resolved(compute))
+    scans = found.for_weights(loaded, report)
+    request = LabelChoice().parse(loaded, found.reading, resolved(compute))
     recipe = recipe_for(loaded, epochs, streets, seed)
     drives = None
     if not loose:

@@ -48,12 +48,11 @@ def fleet(
     from amvnet.weights.file import load
 
     pipeline = import_optional("amvnet.fleet.pipeline", "fleet")
-    choice = ScanChoice(columns=columns, dtype=dtype)
+    reading = ScanChoice(columns=columns, dtype=dtype).parse(sensor_choice).reading
     if weights == AUTO:
-        sensor, layout = sensor_choice.parse(), choice.parse().layout
-        weights, reason = pipeline.choose_weights(inputs, out, sensor, layout)
+        weights, reason = pipeline.choose_weights(inputs, out, reading)
         report(f"weights {weights}, {reason}")
-    request = labels.parse(load(weights), choice, sensor_choice, compute)
+    request = labels.parse(load(weights), reading, compute)
     with progress("labelling") as step:
         written = pipeline.label_fleet(
             inputs,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_for, load_segmenter
+from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_segmenter, open_inputs
 from amvnet.config.bounds import Range
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -54,10 +54,8 @@ def map(
     from amvnet.engines.precision import resolved
     from amvnet.files import alone_in, digest, write_json
     from amvnet.inference.drive import find_poses
-    from amvnet.inference.listing import find_inputs
     from amvnet.inference.map import SavedMap, describe_map, map_drive
     from amvnet.outputs import check_outputs
-    from amvnet.sensors.normalise import Normaliser
 
     check_ending(out)
     if json is not None and json.resolve() == out.resolve():
@@ -66,12 +64,10 @@ def map(
     if json is not None:
         outputs[json] = FIGURES
 
-    sensor, options = sensor_choice.parse(), choice.parse()
-    found = find_inputs([inputs], options)
-    weights, loaded = load_for(found, weights, sensor)
-    scans, _ = found.scans(loaded.taxonomy, Normaliser(loaded.expects, sensor, report))
+    found, weights, loaded = open_inputs([inputs], choice, sensor_choice, weights)
+    scans = found.for_weights(loaded, report)
     files = [path for scan in scans for path in scan.files]
-    request = LabelChoice().parse(loaded, choice, sensor_choice, resolved(compute))
+    request = LabelChoice().parse(loaded, found.reading, resolved(compute))
 
     # The files beside a map have a digest in their names: with its name, names could be too long.
     beside = f".{digest(out.name)}"

@@ -13,8 +13,8 @@ from amvnet.cli.options import (
     ScanChoice,
     SensorChoice,
     given_options,
-    load_for,
     load_segmenter,
+    open_inputs,
 )
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
@@ -61,7 +61,6 @@ def predict(
     from amvnet.cli.tables import labelled_table
     from amvnet.engines.precision import resolved
     from amvnet.inference.journal import JOURNAL
-    from amvnet.inference.listing import find_inputs
     from amvnet.inference.pipeline import check_faults
     from amvnet.inference.predict import predict as predict_inputs
     from amvnet.inference.predict import report_certainty
@@ -71,10 +70,9 @@ def predict(
             raise InputError(f"{text}: expected a path, found a URL; use amvnet fleet")
     compute = resolved(compute)  # the labels depend on what "auto" is
     drive = drive_choice.parse()
-    found = find_inputs(inputs, choice.parse())
     where = f"; labels go to {out}"
-    weights, loaded = load_for(found, weights, sensor_choice.parse(), where)
-    request = labels.parse(loaded, choice, sensor_choice, compute)
+    found, weights, loaded = open_inputs(inputs, choice, sensor_choice, weights, where)
+    request = labels.parse(loaded, found.reading, compute)
     is_new = not (Path(out) / JOURNAL).exists()
     also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, drive_choice.poses)
 

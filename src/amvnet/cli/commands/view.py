@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import ScanChoice, SensorChoice, load_for, load_segmenter
+from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter, open_inputs
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -60,7 +60,6 @@ def view(
             "expected no --taxonomy together with --weights, which define their classes; "
             "leave it out"
         )
-    sensor = sensor_choice.parse()
     # Check the page's place before any scan is segmented, so that no time is wasted.
     if html is not None:
         html = page_name(html)
@@ -68,20 +67,16 @@ def view(
         make_folder(html.parent)
 
     classes = None if taxonomy is None else TAXONOMIES[taxonomy]
-    found = find_inputs(inputs, choice.parse())
-    normaliser = Normaliser(None, sensor, report)
-    loaded = None
-    if weights is not None:
-        weights, loaded = load_for(found, weights, sensor)
-        classes = loaded.taxonomy
-        normaliser = Normaliser(loaded.expects, sensor, report)
-
-    found_scans, classes = found.scans(classes, normaliser)
+    segmenter = None
+    if weights is None:
+        found = find_inputs(inputs, choice.parse(sensor_choice))
+        found_scans, classes = found.scans(classes, Normaliser(None, found.reading.sensor, report))
+    else:
+        found, weights, loaded = open_inputs(inputs, choice, sensor_choice, weights)
+        found_scans, classes = found.for_weights(loaded, report), loaded.taxonomy
+        segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
     if labels is not None:
         check_labels(labels, len(found_scans))
-    segmenter = None
-    if loaded is not None:
-        segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
     chosen = evenly_spaced(found_scans, scans)
     with place_for_page(html) as page, progress("looking") as step:
         shown = show_scans(chosen, segmenter, labels, progress=step)
