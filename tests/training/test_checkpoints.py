@@ -20,22 +20,23 @@ from amvnet.files import alone_in
 from amvnet.scan import Scan
 from amvnet.training.stage import WholeCheckpoints
 
-from fixtures.commands import files, refused, run_cli
+from fixtures.commands import files, refused, succeed
 from fixtures.tiny import make_streets, write_recipe
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with `data`, `recipe.yaml`, and `run`, which has trained both networks."""
     root = tmp_path_factory.mktemp("world")
     make_streets(root / "data")
     epochs = {"rv": {"epochs": 1}, "bev": {"epochs": 1}}
     write_recipe(root / "recipe.yaml", training=epochs, stages=["rv", "bev"])
-    assert run_cli(*command(root, root / "run").split()) == (0, "")
+    succeed(command(root, root / "run"))
     return root
 
 
-def command(world: Path, out: Path) -> str:
-    return f"train {world}/recipe.yaml --data {world}/data --out {out}"
+def command(world: Path, out: Path, options: str = "") -> str:
+    return f"train {world}/recipe.yaml --data {world}/data --out {out} {options}"
 
 
 def test_a_checkpoint_is_replaced_only_by_a_whole_one(
@@ -63,29 +64,28 @@ def test_a_training_writes_nothing_into_the_temporary_folder_of_the_system(
 ) -> None:
     """That folder may be on another file system, or full."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
-    assert run_cli(*command(world, tmp_path / "run").split(), "--stage", "rv") == (0, "")
+    succeed(command(world, tmp_path / "run", "--stage rv"))
 
 
 @pytest.mark.parametrize("stage", ["rv", pytest.param("all", marks=pytest.mark.full)])
 def test_a_stage_is_trained_by_one_call_at_a_time(world: Path, tmp_path: Path, stage: str) -> None:
-    """Another call that trains the stage changes nothing; the other network can be trained."""
+    """A second call for the stage changes nothing; meanwhile, the other network can be trained."""
     out = tmp_path / "run"
-    assert run_cli(*command(world, out).split(), "--stage", "bev") == (0, "")
-    with alone_in(out, ".rv.lock"):
+    succeed(command(world, out, "--stage bev"))
+    with alone_in(out, ".rv.lock"):  # as a call that trains the range view has it
         before = {name: (out / name).read_bytes() for name in files(out)}
-        words = f"--stage {stage} --resume --training.seed 2 --training.bev.epochs 1"
-        refused(f"{command(world, out)} {words}", "another run")
+        options = f"--stage {stage} --resume --training.seed 2 --training.bev.epochs 1"
+        refused(command(world, out, options), "another run")
         assert {name: (out / name).read_bytes() for name in files(out)} == before
-        assert run_cli(*command(world, out).split(), "--stage", "bev", "--resume") == (0, "")
-    assert run_cli(*command(world, out).split(), "--resume") == (0, "")
+        succeed(command(world, out, "--stage bev --resume"))
+    succeed(command(world, out, "--resume"))
     assert not [name for name in files(out) if "lock" in name]
 
 
 def test_a_run_does_not_write_into_a_dataset(world: Path, tmp_path: Path) -> None:
     shutil.copytree(world / "data", tmp_path / "data")
     before = files(tmp_path)
-    train = f"train {world}/recipe.yaml --data {world}/data --out {tmp_path}/data"
-    refused(train, f"{tmp_path}/data: expected a new folder")
+    refused(command(world, tmp_path / "data"), f"{tmp_path}/data: expected a new folder")
     assert files(tmp_path) == before
 
 
@@ -101,8 +101,7 @@ def test_a_killed_process_that_reads_scans_is_one_line(
         return read(*arguments, **options)
 
     monkeypatch.setattr(SemanticKitti, "read", read_or_die)
-    options = "--stage rv --training.workers 1"
-    train = f"train {world}/recipe.yaml --data {world}/data --out {tmp_path}/run {options}"
+    train = command(world, tmp_path / "run", "--stage rv --training.workers 1")
     refused(train, "training.workers", "killed")
 
 
@@ -120,15 +119,15 @@ def test_resume_removes_what_killed_runs_have_left_half_written(
 ) -> None:
     out = tmp_path / "run"
     shutil.copytree(world / "run", out)
-    half = f".{32 * '0'}.part"
-    for name in (f"{half}.yaml", f"rv/{half}.ckpt", f"bev/{half}.safetensors", "rv/.my.part"):
+    part = f".{32 * '0'}.part"  # begins the names that `atomic_write` gives
+    for name in (f"{part}.yaml", f"rv/{part}.ckpt", f"bev/{part}.safetensors", "rv/.my.part"):
         (out / name).write_bytes(b"half")
 
     # The other network may be trained by another call, which has not finished its files.
-    assert run_cli(*command(world, out).split(), "--resume", "--stage", "rv") == (0, "")
-    assert not (out / f"rv/{half}.ckpt").exists()
-    assert (out / f"bev/{half}.safetensors").exists()
-    assert run_cli(*command(world, out).split(), "--resume") == (0, "")
+    succeed(command(world, out, "--resume --stage rv"))
+    assert not (out / f"rv/{part}.ckpt").exists()
+    assert (out / f"bev/{part}.safetensors").exists()
+    succeed(command(world, out, "--resume"))
     assert files(out) == files(world / "run") | {"rv/.my.part"}
 
 
@@ -137,5 +136,5 @@ def test_truncated_weights_of_a_finished_run_are_made_again(world: Path, tmp_pat
     shutil.copytree(world / "run", out)
     path = out / "weights.safetensors"
     path.write_bytes(path.read_bytes()[:1000])
-    assert run_cli(*command(world, out).split(), "--resume") == (0, "")
+    succeed(command(world, out, "--resume"))
     assert path.read_bytes() == (world / "run/weights.safetensors").read_bytes()

@@ -24,7 +24,7 @@ from amvnet.config.yaml_files import read_yaml
 from amvnet.weights.card import model_card
 from amvnet.weights.file import FORMAT, Weights, load
 
-from fixtures.commands import fails, run_cli
+from fixtures.commands import fails, run_cli, succeed
 from fixtures.memory import memory_below
 from fixtures.tiny import fresh_weights
 
@@ -52,17 +52,22 @@ def change(tree: Any, path: str, value: Any) -> Any:
 
 
 def places(tree: Any, kind: type, path: str = "") -> Iterator[str]:
-    """Yield the places of values of a type, but no integer that may be 0; of a list, the first."""
+    """Yield the places of the values of a type, each a path of keys separated by spaces.
+
+    Of a list, only the first value counts. Integers that are 0 are left out, because 0 is allowed
+    in their places.
+    """
     if isinstance(tree, dict):
         for key, value in tree.items():
             yield from places(value, kind, f"{path} {key}".strip())
     elif isinstance(tree, list | tuple):
-        yield from places(tree[0], kind, f"{path} 0")
+        for first in tree[:1]:
+            yield from places(first, kind, f"{path} 0")
     elif type(tree) is kind and (tree or kind is float):
         yield path
 
 
-# Values of the model that no file of this package has, by their places.
+# Changes of the model: a place in it, and a value that no file of this package has there.
 SIZES = tuple(places(to_dict(ModelConfig()), int))
 NUMBERS = tuple(places(to_dict(ModelConfig()), float))
 MODEL: dict[str, tuple[str, Any]] = {
@@ -73,6 +78,7 @@ MODEL: dict[str, tuple[str, Any]] = {
     **{f"{path} = infinity": (path, math.inf) for path in NUMBERS},
     **{f"{path} = 10**400": (path, 10**400) for path in NUMBERS},
     "gru_padding = 10**12": ("range_net gru_padding", 1e12),
+    "decoder = 10**12": ("polar_net decoder", [HUGE] * 3),
     "many widths": ("range_net widths", [4] * 100_000),
     "widths in widths": ("range_net widths", [[4], [4]]),
     "large image": ("range_view", {"height": 16384, "width": 16384}),
@@ -83,7 +89,7 @@ MODEL: dict[str, tuple[str, Any]] = {
     "long key": ("range_net", {"k" * 1_000_000: 1}),
 }
 
-# Other values of the description.
+# The same for the other fields of the description.
 DESCRIPTION: dict[str, tuple[str, Any]] = {
     "no taxonomy": ("taxonomy", {}),
     "raw ids as text": ("taxonomy train_to_raw 3", "ten"),
@@ -124,7 +130,7 @@ def to_nan(tensor: torch.Tensor) -> torch.Tensor:
     return changed
 
 
-# Changes of the parameter `WEIGHT`.
+# Changes of a parameter.
 WEIGHT = "range_net.scores.weight"
 TENSORS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "NaN": to_nan,
@@ -161,14 +167,18 @@ def description(weights: Weights) -> dict[str, Any]:
 
 
 def write_weights(path: Path, tensors: Mapping[str, torch.Tensor], text: str) -> Path:
+    """Write tensors with a text in the place of the description in JSON."""
     save_file(dict(tensors), path, metadata={"amvnet": text})
     return path
 
 
 @pytest.fixture(scope="module")
 def good(weights: Weights, description: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a file without a change, which is not refused: the changes alone are at fault."""
     path = tmp_path_factory.mktemp("good") / "good.safetensors"
-    return write_weights(path, weights.tensors, json.dumps(description))
+    write_weights(path, weights.tensors, json.dumps(description))
+    succeed("info", path)
+    return path
 
 
 @dataclass(frozen=True)
@@ -178,7 +188,7 @@ class Content:
 
 
 def hostile_weights(weights: Weights, description: dict[str, Any]) -> dict[str, Content]:
-    """Return the content of a file for each change."""
+    """Return the content of a file for each change, by the name of the change."""
     texts = {}
     for name, (place, value) in MODEL.items():
         texts[name] = json.dumps(change(description, f"model {place}", value))
@@ -205,14 +215,14 @@ def hostile_weights(weights: Weights, description: dict[str, Any]) -> dict[str, 
     fewer = {name: value for name, value in weights.tensors.items() if name != WEIGHT}
     contents["fewer tensors"] = Content(fewer, good_text)
 
-    # A network that the file lacks would be built all the same, with random values.
+    # A network of which the file has no tensor, which a reader could build with random values.
     large = change(description, "model polar_net widths", [8192] * 8)
     present = {name: value for name, value in weights.tensors.items() if "range_net" in name}
     contents["absent"] = Content(present, json.dumps(large))
     return contents
 
 
-# A change of each kind.
+# One change of each kind, for the tests of each change to this package.
 QUICK = (
     "range_net stem = 10**12",
     "polar_view radial = 0",
@@ -255,6 +265,7 @@ def check_refused(paths: Iterable[Path]) -> None:
             assert error[:-1].isprintable(), path
 
 
+@pytest.mark.usefixtures("good")
 @pytest.mark.parametrize(
     "names", [QUICK, pytest.param(None, marks=pytest.mark.full)], ids=["of each kind", "all"]
 )
@@ -269,15 +280,15 @@ def test_hostile_weights_are_refused(
     check_refused(paths)
 
 
-@pytest.mark.parametrize("text", YAML_TEXTS)
+@pytest.mark.parametrize("text", YAML_TEXTS.values(), ids=YAML_TEXTS)
 def test_hostile_yaml_is_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text(YAML_TEXTS[text])
+    path.write_text(text)
     with memory_below(MEMORY):
         fails(lambda: read_yaml(path, "a recipe"), "mine.yaml")
 
 
-# ---- what is said of files that are not hostile but unlucky, and of records that are deep
+# ---- files that are unlucky, not hostile
 
 
 @pytest.mark.parametrize("share", [0.01, 0.5, 0.999])
