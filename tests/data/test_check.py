@@ -83,6 +83,18 @@ def test_points_and_scans_are_counted_by_class(data: Path) -> None:
     assert list(report.warnings()) == ["train: no point of car", "val: no point of car"]
 
 
+@pytest.mark.parametrize("sensor", [None, {"height": 1.2}])
+def test_check_says_what_is_assumed_of_the_sensor_once(
+    data: Path, sensor: dict[str, Any] | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    describe(data.parent, **({"sensor": sensor} if sensor else {}))
+    run_cli("check", data)
+    lines = [line for line in capsys.readouterr().out.splitlines() if "assumed" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith(f"{data.parent}/a/0.npy: assumed intensity")
+    assert ("sensor 1.20 m over the ground" in lines[0]) == (sensor is not None)
+
+
 @pytest.mark.parametrize("name", MAKERS)
 def test_the_counts_of_a_benchmark_are_those_of_its_scans(name: str, tmp_path: Path) -> None:
     dataset = open_dataset(MAKERS[name](tmp_path / "set").spec)

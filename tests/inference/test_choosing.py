@@ -19,7 +19,7 @@ from amvnet.sensors.built_in import lasers_of, weights_for
 from amvnet.sensors.lasers import SensorGeometry
 from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, make_sensor
 
-from fixtures.commands import fails, files, succeed
+from fixtures.commands import fails, files, refused, succeed
 from fixtures.datasets import make_nuscenes, make_semantickitti
 from fixtures.sensors import LASERS, place
 
@@ -102,14 +102,25 @@ def test_the_yaml_file_of_own_scans_describes_the_sensor_that_chooses(tmp_path: 
     path = tmp_path / "own.yaml"
     path.write_text("scans: '*.npy'\nclasses: {car: 1}\nsensor: hdl32e\n")
     assert find_inputs([str(path)]).choose_weights()[0] == "sim-hdl32e"
+    path.write_text("scans: '*.npy'\nclasses: {car: 1}\nsensor: {name: hdl32e, height: 1}\n")
+    assert find_inputs([str(path)]).choose_weights()[0] == "sim-hdl32e"
     path.write_text("scans: '*.npy'\nclasses: {car: 1}\n")
     assert find_inputs([str(path)]).choose_weights()[0] == LAST
 
 
 def test_scans_that_cannot_be_read_choose_as_unknown_lasers(tmp_path: Path) -> None:
-    (tmp_path / "scan.bin").write_bytes(b"123")
+    for name in ("a.bin", "b.bin"):
+        (tmp_path / name).write_bytes(b"123")
     choice = find_inputs([str(tmp_path)]).choose_weights()
     assert choice == (LAST, "as the lasers are unknown")
+
+
+def test_a_single_scan_that_cannot_be_read_is_refused_before_its_labels_get_a_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "scan.bin").write_bytes(b"123")
+    refused(f"predict {tmp_path}/scan.bin --out {tmp_path}/labels", "scan.bin: expected rows")
+    assert not capsys.readouterr().out
 
 
 def test_scans_of_several_sensors_in_a_folder_choose_no_lasers(tmp_path: Path) -> None:
@@ -117,6 +128,27 @@ def test_scans_of_several_sensors_in_a_folder_choose_no_lasers(tmp_path: Path) -
         write(tmp_path / f"{index}.npy", sensor)
     choice = find_inputs([str(tmp_path)]).choose_weights()
     assert choice == (LAST, "as the scans are of several sensors")
+
+
+def test_evaluate_says_what_is_assumed_of_a_sensor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = write(tmp_path / "scan.npy", "vlp16", 1.1)
+    np.ones(len(np.load(scan)), np.uint32).tofile(tmp_path / "scan.label")
+    text = "scans: '*.npy'\nlabels: .label\nclasses: {car: 1}\nsplit: {val: scan}\n"
+    (tmp_path / "own.yaml").write_text(text)
+    (tmp_path / "map.yaml").write_text("classes: {car: [car]}\n")
+    succeed(f"evaluate {tmp_path}/own.yaml --classes {tmp_path}/map.yaml")
+    assert "sensor 1.10 m over the ground" in capsys.readouterr().out
+
+
+def test_scans_of_one_name_are_refused_with_their_folders(tmp_path: Path) -> None:
+    paths = [tmp_path / name / "x/0.npy" for name in ("a", "b")]
+    for path in paths:
+        path.parent.mkdir(parents=True)
+        write(path, "vlp16")
+    command = f"predict {paths[0].parent} {paths[1].parent} --out {tmp_path}/labels"
+    refused(command, f"found 0 in {paths[0]} and in {paths[1]};")
 
 
 # ---- labels

@@ -682,3 +682,18 @@ def test_a_stated_unit_settles_that_a_sensor_is_high() -> None:
     fails(lambda: Normaliser(weights.expects)(Recording("a")).to_scan(cloud), "--unit")
     for sensor in (Sensor(unit="m"), Sensor(height=6.0)):
         assert Normaliser(weights.expects, sensor)(Recording("a")).to_scan(cloud).valid.any()
+
+
+def test_a_name_in_a_description_is_that_of_a_known_sensor(tmp_path: Path) -> None:
+    known = KNOWN_SENSORS["pandar64"]
+    assert make_sensor({"name": "pandar64"}) == known
+    assert make_sensor({"name": "pandar64", "height": 2}) == replace(known, height=2)
+    fails(lambda: make_sensor({"name": "pandar6444"}), "did you mean pandar64?")
+
+    path = tmp_path / "robot.yaml"
+    path.write_text("name: pandar64\nfov_up: 12\n")
+    assert make_sensor(str(path)) == replace(known, fov_up=12)
+    path.write_text("name: pandar6444\n")
+    fails(lambda: make_sensor(str(path)), path, "did you mean pandar64?")
+    path.write_text("fov_up: 12\n")
+    assert make_sensor(str(path)).name == "robot"

@@ -359,6 +359,8 @@ def load_dataset(
 ) -> tuple[str, Weights, Dataset]:
     """Return the weights for a dataset by `load_for`, and the dataset, normalised to them.
 
+    Lines report what is assumed of its sensors.
+
     Args:
         mapping: maps the classes of the dataset and of the weights to others, so that they may
             differ.
@@ -374,7 +376,7 @@ def load_dataset(
     name, loaded = load_for(Inputs([dataset]), weights)
     if mapping is None:
         dataset = with_classes(dataset, loaded.taxonomy)
-    return name, loaded, normalised(dataset, Normaliser(loaded.expects))
+    return name, loaded, normalised(dataset, Normaliser(loaded.expects, report=report))
 
 
 def method_for(weights: Weights, method: MethodName = "amvnet") -> MethodName:

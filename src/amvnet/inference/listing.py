@@ -60,6 +60,9 @@ class Inputs:
         """Return the name of built-in weights for the first recording, and in words why these.
 
         This reads and measures the first scans; `scans` does not repeat it.
+
+        Raises:
+            InputError: if the only scan of the inputs cannot be read.
         """
         sensor = self.reading.sensor
         part = self._parts[0]
@@ -73,6 +76,9 @@ class Inputs:
         measured = Measured(sensor, MEASURED_HEIGHT)
         measured.learn(recordings[0].first(MEASURED_SCANS))
         usual = measured.usual
+        scans = [scan for each in self._parts for one in each.recordings() for scan in one.scans]
+        if usual is None and len(scans) == 1:
+            recordings[0].read(scans[0], keep=True)
         # If the origin lies on the ground, the lasers were measured as if from this height.
         if measured.is_mixed or (usual is not None and not usual.frame.is_on_ground(sensor)):
             self._known = (recordings[0], usual)

@@ -382,14 +382,14 @@ def check_output(scans: Sequence[ScanFile], output: OutputOptions) -> None:
 
 def _check_names(scans: Sequence[ScanFile]) -> None:
     """Raise InputError if two scans would have the same files."""
-    paths: set[Path] = set()
+    named: dict[Path, ScanFile] = {}
     for scan in scans:
-        if scan.scores_path in paths:
+        other = named.setdefault(scan.scores_path, scan)
+        if other is not scan:
             raise InputError(
-                f"expected scans of different names, found {scan.name} twice "
-                f"({scan.scores_path.stem}); segment them in two runs with two folders"
+                f"expected scans of different names, found {scan.scores_path.stem} in {other.path} "
+                f"and in {scan.path}; segment them in two runs with two folders"
             )
-        paths.add(scan.scores_path)
 
 
 def _check_folder(scan: ScanFile, output: OutputOptions) -> None:

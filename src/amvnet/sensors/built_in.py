@@ -27,8 +27,8 @@ def weights_for(
     fitting = [name for name in _fitting(lasers) if name in names]
     found = describe_lasers(lasers)
     if not fitting:
-        return names[-1], f"as none with these classes were trained for such lasers ({found})"
-    kind = "all kinds of lasers" if BUILT_IN[fitting[0]] == ANY else "such lasers"
+        return names[-1], f"as none with these classes were trained for such a LiDAR ({found})"
+    kind = "all kinds of LiDARs" if BUILT_IN[fitting[0]] == ANY else "such LiDARs"
     return fitting[0], f"trained for {kind} ({found})"
 
 

@@ -223,8 +223,8 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
     """Return a sensor with some attributes overridden.
 
     Args:
-        sensor: a name in `KNOWN_SENSORS`; attributes of `Sensor`; or a YAML file with such
-            attributes. By default the sensor is unknown.
+        sensor: a name in `KNOWN_SENSORS`; attributes of `Sensor`, in which `name` stands for what
+            is known by it; or a YAML file with such attributes. By default the sensor is unknown.
         options: attributes of `Sensor`, which take precedence unless they are None. `rotate`,
             `offset` and `own_body` may be texts of numbers separated by commas.
 
@@ -235,6 +235,8 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
     base = Sensor()
     if isinstance(sensor, Mapping):
         changes = {**sensor, **changes}
+        if "name" in sensor:
+            base = _read_sensor(str(changes.pop("name")))
     elif sensor is not None:
         base = _read_sensor(str(sensor))
 
@@ -273,7 +275,8 @@ def _read_sensor(text: str) -> Sensor:
             f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md"
         )
     with errors_of(path):
-        return make_sensor({"name": path.stem, **tree})
+        described = make_sensor(tree)
+    return described if described.name else dataclasses.replace(described, name=path.stem)
 
 
 def _models_of(text: str) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report, show
@@ -15,13 +16,15 @@ if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset
     from amvnet.data.recordings import ScanFile
 
+MEASURED_RECORDINGS = 10  # number of recordings whose sensors are reported
+
 
 def check(data: str, /, choice: TrainingChoice) -> None:
     """Check the labels of all scans to train on, to validate with and to test on.
 
     If there are too few sequences for a training, their labels are checked before this is said.
-    Of scans that a YAML file describes, the body of the car is measured, too. For a folder of scans
-    without such a file, the beginning of one is written beside it.
+    Of scans that a YAML file describes, the sensor and the body of the car are measured, too. For a
+    folder of scans without such a file, the beginning of one is written beside it.
 
     Args:
         data: the dataset.
@@ -43,6 +46,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
         )
     dataset = open_dataset(data)
     scans = [scan.read for recording in dataset.recordings() for scan in recording.scans]
+    _report_sensors(dataset)
     body = measure_body(scans, described_sensor(dataset))
     if body is not None:
         report(
@@ -59,6 +63,20 @@ def check(data: str, /, choice: TrainingChoice) -> None:
         raise
     usable = _check(dataset, splits)
     report(f"{counted(usable, 'scan')} can be trained on or scored")
+
+
+def _report_sensors(dataset: Dataset) -> None:
+    """Report what trainings and scores assume of the sensors of some recordings."""
+    from amvnet.data.spacing import evenly_spaced
+    from amvnet.sensors.expectation import Expectation
+    from amvnet.sensors.lidars import ANY
+    from amvnet.sensors.normalise import Normaliser, normalised
+
+    normaliser = Normaliser(Expectation.of_sensor(ANY), report=report)
+    recordings = normalised(dataset, normaliser).recordings()
+    for recording in evenly_spaced(recordings, MEASURED_RECORDINGS):
+        with suppress(InputError):  # a broken scan is named when its labels are checked
+            recording.scan(recording.scans[0])
 
 
 def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanFile]]) -> int:
