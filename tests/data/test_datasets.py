@@ -14,7 +14,7 @@ from amvnet.cli.options import LabelledChoice
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.open import is_dataset, open_dataset
-from amvnet.data.datasets.select import to_train
+from amvnet.data.datasets.training_data import to_train
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 

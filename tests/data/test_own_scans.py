@@ -13,7 +13,7 @@ import yaml
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
-from amvnet.data.datasets.select import to_mix_in, to_train
+from amvnet.data.datasets.training_data import to_mix_in, to_train
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError

@@ -17,9 +17,8 @@ from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import is_dataset, open_dataset
-from amvnet.data.datasets.select import to_train
 from amvnet.data.datasets.simulated import SimulatedStreets
-from amvnet.data.datasets.training_data import Source, TrainingData
+from amvnet.data.datasets.training_data import Source, TrainingData, to_train
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.laser_order import lasers_by_order

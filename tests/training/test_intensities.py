@@ -14,7 +14,7 @@ from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import Recipe, StageName
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.datasets.select import to_train
+from amvnet.data.datasets.training_data import to_train
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import SIMULATED_QUANTILES
 from amvnet.sensors.normalise import Normaliser, normalised

@@ -16,9 +16,8 @@ from amvnet.config.schema import AugmentConfig, Recipe
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
-from amvnet.data.datasets.select import to_mix_in, to_train
 from amvnet.data.datasets.semantickitti import SemanticKitti
-from amvnet.data.datasets.training_data import Source, TrainingData
+from amvnet.data.datasets.training_data import Source, TrainingData, to_mix_in, to_train
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError

@@ -117,7 +117,7 @@ class TrainingChoice:
         Raises:
             InputError: if there are no such sequences, or no scans to train on.
         """
-        from amvnet.data.datasets.select import to_train
+        from amvnet.data.datasets.training_data import to_train
 
         source = to_train(dataset, self.train_sequences, self.val_sequences, with_val)
         report_unused(source)
@@ -131,8 +131,7 @@ class TrainingChoice:
         Raises:
             InputError: as `source`.
         """
-        from amvnet.data.datasets.select import named_sequences
-        from amvnet.data.datasets.training_data import Source
+        from amvnet.data.datasets.training_data import Source, named_sequences
 
         train, val = named_sequences(dataset, self.train_sequences, self.val_sequences)
         _report_split(Source.labelled(dataset, train, val))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
 
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import scan_stem
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset
     from amvnet.data.formats.bag_poses import BagPoses
     from amvnet.scan import Scan
+
+Item = TypeVar("Item")
 
 
 @dataclass(eq=False)
@@ -150,3 +154,12 @@ def distinct(names: Iterable[str]) -> list[str]:
         used.add(other)
         apart.append(other)
     return apart
+
+
+def evenly_spaced(items: Sequence[Item], limit: int) -> list[Item]:
+    """Return at most `limit` of the items, evenly spaced, including the first and the last.
+
+    If there are fewer items, return all of them. If `limit` is 1, return the first.
+    """
+    indices = np.linspace(0, len(items) - 1, min(limit, len(items))).astype(int)
+    return [items[index] for index in indices]

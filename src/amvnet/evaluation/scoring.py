@@ -14,8 +14,7 @@ from torch import Tensor
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.recordings import ScanFile
-from amvnet.data.spacing import evenly_spaced
+from amvnet.data.recordings import ScanFile, evenly_spaced
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.drives.consensus import DriveScan
 from amvnet.errors import InputError

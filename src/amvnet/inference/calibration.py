@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from amvnet.data.spacing import evenly_spaced
+from amvnet.data.recordings import evenly_spaced
 from amvnet.engines.export.int8 import MAX_SCANS, SIMULATED, simulated_scans
 from amvnet.errors import InputError
 from amvnet.inference.listing import find_inputs

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amvnet.data.poses import Poses, as_pose, check_rigid, read_poses, times_of
-from amvnet.data.recordings import Recording, ScanFile, by_recording
-from amvnet.data.spacing import evenly_spaced
+from amvnet.data.recordings import Recording, ScanFile, by_recording, evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit, check_steps
 from amvnet.errors import InputError

@@ -9,7 +9,7 @@ from contextlib import suppress
 from amvnet.config.parts import BOTH_NETWORKS, NETWORK_STAGES, PART_OF
 from amvnet.config.schema import Recipe, StageName
 from amvnet.data.datasets.training_data import TrainingData
-from amvnet.data.spacing import evenly_spaced
+from amvnet.data.recordings import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation, trained_sensor

@@ -16,12 +16,12 @@ from amvnet.config.parts import BOTH_NETWORKS, NETWORK_STAGES, PART_OF
 from amvnet.config.schema import NetworkName, Recipe, StageName
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.datasets.select import to_mix_in
 from amvnet.data.datasets.training_data import (
     Source,
     TrainingData,
     digest_of_scans,
     sequence_names,
+    to_mix_in,
 )
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, describe_difference
 from amvnet.errors import InputError

@@ -68,9 +68,8 @@ def adapt(
         resume: continue an earlier run in the folder.
     """
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.select import to_mix_in
     from amvnet.data.datasets.simulated import SimulatedStreets
-    from amvnet.data.datasets.training_data import Source, TrainingData
+    from amvnet.data.datasets.training_data import Source, TrainingData, to_mix_in
     from amvnet.engines.precision import resolved
     from amvnet.inference.drive import find_poses
     from amvnet.models.methods import check_method

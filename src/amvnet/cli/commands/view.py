@@ -44,7 +44,7 @@ def view(
         taxonomy: the classes of labels that belong to no dataset.
         overwrite: replace the page if it exists.
     """
-    from amvnet.data.spacing import evenly_spaced
+    from amvnet.data.recordings import evenly_spaced
     from amvnet.data.taxonomy import TAXONOMIES
     from amvnet.files import make_folder
     from amvnet.inference.listing import find_inputs

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, Normalise
+from amvnet.data.datasets.base import Dataset, Normalise, Split
 from amvnet.data.datasets.description import SPLITS, WILDCARDS, Description, below, read_description
-from amvnet.data.datasets.split import Split
 from amvnet.data.formats.detect import scan_stem
 from amvnet.data.formats.find import ANY_FOLDERS, list_scans, matching
 from amvnet.data.labels.readers import read_raw_labels

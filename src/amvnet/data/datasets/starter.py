@@ -19,7 +19,7 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import scan_stem
 from amvnet.data.formats.find import list_scans
 from amvnet.data.labels.readers import COLUMNS, read_raw_labels
-from amvnet.data.spacing import evenly_spaced
+from amvnet.data.recordings import evenly_spaced
 from amvnet.data.taxonomy import INSTANCE_MASK
 from amvnet.errors import InputError
 from amvnet.files import atomic_write

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from amvnet.data.spacing import evenly_spaced
+from amvnet.data.recordings import evenly_spaced
 
 
 def test_spaced_items_are_distinct_in_order_and_reach_both_ends() -> None:
