@@ -67,7 +67,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
 
 def _report_sensors(dataset: Dataset) -> None:
     """Report what trainings and scores assume of the sensors of some recordings."""
-    from amvnet.data.spacing import evenly_spaced
+    from amvnet.data.recordings import evenly_spaced
     from amvnet.sensors.expectation import Expectation
     from amvnet.sensors.lidars import ANY
     from amvnet.sensors.normalise import Normaliser, normalised
