@@ -21,7 +21,7 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
-from amvnet.onnx_runner import OnnxSegmenter, disagree
+from amvnet.onnx_runner import OnnxSegmenter, disagree, disputed_points
 from amvnet.scan import Scan
 
 GRAPHS = ("range_net", "polar_map")
@@ -59,7 +59,8 @@ class Runner(OnnxSegmenter):
         scores = {"rv": f, "bev": g, "ensemble": np.sqrt(f * g)}
         if self.method == "amvnet":
             merged = scores["ensemble"].copy()
-            merged[uncertain] = self._classify(points, f, g, uncertain)
+            disputed = disputed_points(self.assertion, f, g, uncertain)
+            merged[disputed] = self._classify(points, f, g, disputed)
             scores["amvnet"] = merged
 
         labels = {name: values.argmax(axis=1) + 1 for name, values in scores.items()}

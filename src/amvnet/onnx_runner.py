@@ -43,7 +43,7 @@ CHANNELS = 6  # channels of the range image: x, y, z, intensity, range, mask
 WINDOW = 5  # height and width of the window around a hidden point's pixel, pixels
 OWN_WEIGHT = 1e-3  # weight of a hidden point's own pixel
 LARGEST_DESCRIPTION = 10_000_000  # largest size of amvnet.json, bytes
-HEAD_BATCH = 2048  # number of uncertain points that the point head classifies at a time
+HEAD_BATCH = 2048  # number of disputed points that the point head classifies at a time
 TINY = np.float32(1e-12)  # smallest divisor
 
 
@@ -176,8 +176,9 @@ class OnnxSegmenter:
         g = self.score_polar_view(points)
         uncertain = disagree(self.assertion, f, g)
         merged = np.sqrt(f * g)
-        if self.method == "amvnet" and uncertain.any():
-            merged[uncertain] = self._classify(points, f, g, uncertain)
+        disputed = disputed_points(self.assertion, f, g, uncertain)
+        if self.method == "amvnet" and disputed.any():
+            merged[disputed] = self._classify(points, f, g, disputed)
         return merged, uncertain
 
     def score_range_view(self, scan: Scan) -> np.ndarray:
@@ -207,10 +208,10 @@ class OnnxSegmenter:
         return softmax(scores.reshape(len(occupied), c.vertical, -1)[slot, voxel])
 
     def _classify(
-        self, points: np.ndarray, f: np.ndarray, g: np.ndarray, uncertain: np.ndarray
+        self, points: np.ndarray, f: np.ndarray, g: np.ndarray, disputed: np.ndarray
     ) -> np.ndarray:
-        """Return (U, K) class probabilities of the uncertain points by the point head."""
-        index = np.flatnonzero(uncertain)
+        """Return (U, K) class probabilities of the disputed points by the point head."""
+        index = np.flatnonzero(disputed)
         near = nearest_others(points[:, :3], index, self.head.neighbours)
         table = np.concatenate([f, g, points], axis=1)
 
@@ -362,6 +363,21 @@ def disagree(assertion: AssertionConfig, f: np.ndarray, g: np.ndarray) -> np.nda
     similarity = (f * g).sum(axis=1) / np.sqrt(np.maximum(squared_lengths, TINY))
     uncertain: np.ndarray = np.minimum(similarity, 1) <= assertion.threshold
     return uncertain
+
+
+def disputed_points(
+    assertion: AssertionConfig, f: np.ndarray, g: np.ndarray, uncertain: np.ndarray
+) -> np.ndarray:
+    """Return (P,) bool: the uncertain points that the head classifies; see `AssertionConfig`."""
+    if not assertion.lead:
+        return uncertain
+    f, g = f[uncertain], g[uncertain]
+    differs = f.argmax(axis=1) != g.argmax(axis=1)
+    squares = f * g
+    is_close = squares * np.float32(assertion.lead**2) >= squares.max(axis=1, keepdims=True)
+    disputed = uncertain.copy()
+    disputed[uncertain] = differs | (is_close.sum(axis=1) > 1)
+    return disputed
 
 
 def softmax(scores: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -19,6 +19,7 @@ from amvnet.engines.torch import TorchEngine
 from amvnet.inference.segmentation import expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models import layers
+from amvnet.models.assertion import disputed_points
 from amvnet.models.layers import ConvBlock
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
@@ -80,7 +81,8 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
 
     head = model.point_head
     assert head is not None
-    index = model.assertion(f, g, batch.points).nonzero()[:, 0]
+    uncertain = model.assertion(f, g, batch.points)
+    index = disputed_points(f, g, uncertain, model.lead).nonzero()[:, 0]
     n = head.config.neighbours
     near = torch.from_numpy(nearest_by_scipy(batch.points[:, :3].numpy(), index.numpy(), n))
     table = point_table(batch.points, f, g)

@@ -14,7 +14,7 @@ import torch
 from matplotlib.image import imread
 
 import amvnet
-from amvnet.config.schema import AssertionConfig, Recipe
+from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
@@ -64,7 +64,13 @@ def dataset(world: Path) -> Dataset:
 
 
 def with_tau(weights: Weights, tau: float) -> Weights:
-    return replace(weights, model=replace(weights.model, assertion=AssertionConfig(tau)))
+    assertion = replace(weights.model.assertion, threshold=tau)
+    return replace(weights, model=replace(weights.model, assertion=assertion))
+
+
+def with_lead(weights: Weights, lead: float) -> Weights:
+    assertion = replace(weights.model.assertion, lead=lead)
+    return replace(weights, model=replace(weights.model, assertion=assertion))
 
 
 def analyze_08(dataset: Dataset, weights: Weights) -> Analysis:
@@ -106,6 +112,16 @@ def test_a_swept_tau_gives_what_weights_with_that_tau_give(
     assert miou == pytest.approx(100 * expected["miou"], abs=0.2)
     assert accuracy == pytest.approx(100 * expected["accuracy"], abs=0.2)
     assert accuracy > 10  # far from nothing
+
+
+def test_a_swept_tau_gives_what_weights_with_that_tau_give_if_the_head_has_only_disputed_points(
+    dataset: Dataset, weights: Weights
+) -> None:
+    led = with_lead(weights, 1.3)
+    _, _, miou, _ = analyze_08(dataset, led).sweep()[85]
+    _, expected = figures_of(dataset, with_tau(led, 0.85))
+    assert miou == pytest.approx(100 * expected["miou"], abs=0.02)
+    assert miou != pytest.approx(analyze_08(dataset, weights).sweep()[85][2], abs=0.02)
 
 
 @pytest.mark.parametrize("are_matched", [False, True])

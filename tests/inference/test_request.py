@@ -51,6 +51,13 @@ def test_each_field_changes_the_settings() -> None:
         assert json.loads(json.dumps(other.settings)) == other.settings
 
 
+def test_weights_that_choose_other_points_for_the_head_change_the_settings() -> None:
+    weights = fresh_weights()
+    assertion = replace(weights.model.assertion, lead=3.0)
+    other = replace(weights, model=replace(weights.model, assertion=assertion))
+    assert LabellingRequest(other).settings != LabellingRequest(weights).settings
+
+
 def test_equal_requests_have_equal_settings() -> None:
     request = LabellingRequest(fresh_weights())
     assert LabellingRequest(fresh_weights()).settings == request.settings

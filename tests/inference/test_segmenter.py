@@ -463,6 +463,15 @@ def test_fusing_with_weights_takes_their_own_threshold(result: Segmentation) -> 
     assert np.array_equal(fuse(POINTS, *both_networks(result), head=WEIGHTS), result.labels)
 
 
+def test_fusing_with_weights_takes_their_lead(result: Segmentation) -> None:
+    assertion = replace(WEIGHTS.model.assertion, lead=1.3)
+    weights = replace(WEIGHTS, model=replace(WEIGHTS.model, assertion=assertion))
+    expected = amvnet.load(weights)(POINTS)
+    assert np.array_equal(expected.uncertain, result.uncertain)
+    assert np.count_nonzero(expected.labels != result.labels) > 0
+    assert np.array_equal(fuse(POINTS, *both_networks(result), head=weights), expected.labels)
+
+
 def test_fusing_without_a_head_is_the_ensemble(result: Segmentation) -> None:
     assert np.array_equal(fuse(POINTS, *both_networks(result)), labels_by("ensemble"))
 

@@ -19,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.schema import PointHeadConfig
 from amvnet.models import neighbours
 from amvnet.models import point_head as point_head_module
-from amvnet.models.assertion import Disagreement
+from amvnet.models.assertion import Disagreement, disputed_points
 from amvnet.models.layers import freeze
 from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
 from amvnet.models.neighbours import Query
@@ -250,6 +250,41 @@ def test_at_the_threshold_a_point_is_uncertain() -> None:
     points = torch.zeros(2, 4)
 
     assert Disagreement(0.0)(f, f.flip(0), points).all()
+
+
+def test_disputed_points_equal_a_loop_over_the_uncertain_ones() -> None:
+    f, g, points, _ = random_scores()
+    uncertain = Disagreement(0.95)(f, g, points)
+    expected = []
+    for i in range(len(f)):
+        best, second = sorted(math.sqrt(a * b) for a, b in zip(f[i], g[i], strict=True))[:-3:-1]
+        differs = bool(f[i].argmax() != g[i].argmax())
+        expected.append(bool(uncertain[i]) and (differs or best <= 2 * second))
+
+    assert disputed_points(f, g, uncertain, 2).tolist() == expected
+    assert disputed_points(f, g, uncertain, 1.0).sum() < sum(expected)
+    assert 0 < sum(expected) < uncertain.sum()
+    assert disputed_points(f, g, uncertain, 0.0).equal(uncertain)
+    nothing = torch.zeros(len(f), dtype=torch.bool)
+    assert not disputed_points(f, g, nothing, 2.0).any()
+
+
+def test_the_head_classifies_only_disputed_points_and_uncertain_ones_stay(
+    random_scan: RandomScan,
+) -> None:
+    model = whole_model()
+    batch = PointBatch.of([random_scan(40), random_scan(30)])
+    paper = model(batch)
+    model.lead = 1.5
+    scores = model(batch)
+
+    assert scores.uncertain.equal(paper.uncertain)
+    disputed = disputed_points(scores.rv, scores.bev, scores.uncertain, 1.5)
+    assert 0 < disputed.sum() < scores.uncertain.sum()
+    torch.testing.assert_close(scores.merged[disputed], paper.merged[disputed])
+    mean = geometric_mean(scores.rv, scores.bev)
+    torch.testing.assert_close(scores.merged[~disputed], mean[~disputed])
+    assert (scores.merged != paper.merged).any()
 
 
 def test_another_assertion_can_be_written_as_the_page_shows() -> None:

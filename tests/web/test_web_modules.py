@@ -21,7 +21,7 @@ from amvnet import onnx_runner
 from amvnet import scan as scans
 from amvnet.config import schema
 from amvnet.config.nested import to_dict
-from amvnet.config.schema import PolarViewConfig
+from amvnet.config.schema import AssertionConfig, PolarViewConfig
 from amvnet.data.formats import cloud, fields, numpy_files, pcd, raw, rows
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
@@ -696,6 +696,31 @@ def test_few_points_are_repeated_as_neighbours(count: int, tmp_path: Path) -> No
     (page,) = run_page([case], tmp_path)
     expected = nearest_others(points[:count, :3], np.array([0]), NEIGHBOURS)
     assert np.array_equal(page["neighbours"], expected[0])
+
+
+@pytest.mark.parametrize("lead", [0.0, 1.5, 3.0])
+def test_disputed_points_are_those_of_the_onnx_runner(lead: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    f, g = rng.dirichlet(np.full(K, 0.3), (2, 2000)).astype(np.float32)
+    config = AssertionConfig(lead=lead)
+    uncertain = onnx_runner.disagree(config, f, g)
+    expected = np.flatnonzero(onnx_runner.disputed_points(config, f, g, uncertain))
+    for name, values in (("f", f), ("g", g), ("uncertain", uncertain)):
+        values.tofile(tmp_path / name)
+
+    script = f"""
+        import {{ readFileSync }} from "node:fs";
+        import {{ disputedOf }} from {json.dumps((PAGE / "method/fusion.js").as_uri())};
+        const read = (name) => new Uint8Array(readFileSync(name)).buffer;
+        const [f, g] = ["f", "g"].map((name) => new Float32Array(read(name)));
+        const index = disputedOf(f, g, {K}, new Uint8Array(read("uncertain")), {lead});
+        console.log(JSON.stringify([...index]));
+    """
+    assert NODE is not None
+    command = [NODE, "--input-type=module", "-e", script]
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True).stdout
+    assert json.loads(output) == expected.tolist()
+    assert (len(expected) < np.count_nonzero(uncertain)) == (lead > 0)
 
 
 # The numbers of the modules as the package has them; the page's own ones are left out.

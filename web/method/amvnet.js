@@ -1,6 +1,6 @@
-// AMVNet, step by step as in the paper: project, score twice, compare, classify the uncertain points, merge.
+// AMVNet, step by step as in the paper: project, score twice, compare, classify the disputed points, merge.
 
-import { geometricMean, labelsOf, merged, similarityOf } from "./fusion.js";
+import { disputedOf, geometricMean, labelsOf, merged, similarityOf } from "./fusion.js";
 import { classify } from "./head.js";
 import { nearestOthers } from "./neighbours.js";
 import { polarGrid } from "./polar_view.js";
@@ -33,9 +33,9 @@ export async function segment(networks, { points, rows }, step) {
   scores.ensemble = await step("mean of both", () => geometricMean(f, g));
 
   if (method === "amvnet") {
-    const index = Uint32Array.from(uncertain.keys()).filter((i) => uncertain[i]), n = description.point_head.neighbours;
+    const index = disputedOf(f, g, k, uncertain, description.assertion.lead), n = description.point_head.neighbours;
     const neighbours = await step("neighbours", () => (index.length ? nearestOthers(points, index, n) : index));
-    const head = await step("point head", () => classify(networks, { points, f, g, uncertain: index, neighbours }));
+    const head = await step("point head", () => classify(networks, { points, f, g, disputed: index, neighbours }));
     scores.amvnet = await step("merge", () => merged(scores.ensemble, index, head, k));
   }
   return { scores, labels: labelsOfAll(scores, k), similarity, uncertain };

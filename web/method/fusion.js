@@ -17,15 +17,34 @@ export function similarityOf(f, g, k) {
   return similarity;
 }
 
+/**
+ * Return the indices (u) of the uncertain points that the head classifies: at these, the networks name different classes, or
+ * the best class of the mean is at most `lead` times as probable as the second. With a lead of 0, they are all uncertain points.
+ */
+export function disputedOf(f, g, k, uncertain, lead) {
+  const all = Uint32Array.from(uncertain.keys()).filter((i) => uncertain[i]), squared = Math.fround(lead ** 2);
+  return !lead ? all : all.filter((i) => {
+    let inF = i * k, inG = i * k, best = -1, second = -1;  // places of the largest; squares of the mean's probabilities
+    for (let place = i * k; place < (i + 1) * k; place++) {
+      if (f[place] > f[inF]) inF = place;
+      if (g[place] > g[inG]) inG = place;
+      const square = Math.fround(f[place] * g[place]);
+      if (square > best) [best, second] = [square, best];
+      else if (square > second) second = square;
+    }
+    return inF !== inG || Math.fround(second * squared) >= best;
+  });
+}
+
 /** Return the geometric mean (n K) of the networks' probabilities. */
 export function geometricMean(f, g) {
   return f.map((value, place) => Math.sqrt(value * g[place]));
 }
 
-/** Return the mean (n K), in which the uncertain points (u) have the probabilities of the head (u K). */
-export function merged(mean, uncertain, head, k) {
+/** Return the mean (n K), in which the disputed points (u) have the probabilities of the head (u K). */
+export function merged(mean, disputed, head, k) {
   const scores = mean.slice();
-  uncertain.forEach((i, row) => scores.set(head.subarray(row * k, (row + 1) * k), i * k));
+  disputed.forEach((i, row) => scores.set(head.subarray(row * k, (row + 1) * k), i * k));
   return scores;
 }
 

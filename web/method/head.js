@@ -1,20 +1,20 @@
-// The point head (section 3.3 of the paper) decides uncertain points by the scores of both networks around them.
+// The point head (section 3.3 of the paper) decides disputed points by the scores of both networks around them.
 
-const PART = 2048;  // the number of uncertain points that are classified at a time, which limits the memory
+const PART = 2048;  // the number of disputed points that are classified at a time, which limits the memory
 
 /**
- * Return the head's probabilities (u K) of uncertain points (u), given the points (4 p), both networks' probabilities
- * f and g (p K), and the neighbours (u n) of the uncertain points.
+ * Return the head's probabilities (u K) of disputed points (u), given the points (4 p), both networks' probabilities
+ * f and g (p K), and the neighbours (u n) of the disputed points.
  */
-export async function classify(networks, { points, f, g, uncertain, neighbours }) {
+export async function classify(networks, { points, f, g, disputed, neighbours }) {
   const { k, description } = networks, scale = Math.fround(description.point_head.position_scale);
-  const width = 2 * k + 4, n = neighbours.length / uncertain.length, scores = new Float32Array(uncertain.length * k);
+  const width = 2 * k + 4, n = neighbours.length / disputed.length, scores = new Float32Array(disputed.length * k);
 
   const fill = (target, start, i) =>
     [f.subarray(i * k, (i + 1) * k), g.subarray(i * k, (i + 1) * k), points.subarray(4 * i, 4 * i + 4)]
       .forEach((values, part) => target.set(values, start + part * k));
-  for (let first = 0; first < uncertain.length; first += PART) {
-    const part = uncertain.subarray(first, first + PART);
+  for (let first = 0; first < disputed.length; first += PART) {
+    const part = disputed.subarray(first, first + PART);
     const point = new Float32Array(part.length * width), rows = new Float32Array(part.length * n * width);
     part.forEach((i, row) => {
       for (let rank = 0; rank < n; rank++) {

@@ -209,6 +209,10 @@ class AssertionConfig(Bounded):
 
     threshold: Share = 0.85
     """tau: largest cosine similarity of the two networks' scores at an uncertain point."""
+    lead: Annotated[float, Range(0, 1e6)] = 0.0
+    """The head classifies only disputed points: the uncertain points to which the networks give
+    different classes, or at which the ensemble's best class is at most this many times as probable
+    as its second. 0: all uncertain points (paper)."""
 
 
 @dataclass(frozen=True)

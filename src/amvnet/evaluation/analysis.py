@@ -17,8 +17,8 @@ from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.evaluation.scoring import stream_labelled
 from amvnet.inference.segmentation import expand_labels, expand_to_scan, scores_by_method
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.amvnet import replace_uncertain
-from amvnet.models.assertion import Disagreement, cosine_similarity
+from amvnet.models.amvnet import replace_rows
+from amvnet.models.assertion import Disagreement, cosine_similarity, disputed_points
 from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan
@@ -131,9 +131,10 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
 
     # Compute the head's labels of all points that some tau selects.
     more = (_bins(f, g) < SWEPT_BINS) & ~scores.uncertain
+    more = disputed_points(f, g, more, segmenter.model.lead)
     h = segmenter.model.refine(batch, f, g, more)
     assert h is not None
-    head = expand_labels(replace_uncertain(scores.merged, more, h), scan.valid)
+    head = expand_labels(replace_rows(scores.merged, more, h), scan.valid)
 
     # The networks agree on points that they do not see (id 0), whatever tau is.
     bins = np.where(scan.valid, expand_to_scan(_bins(f, g), scan.valid), BINS - 1)

@@ -45,14 +45,16 @@ class Fusion:
         if isinstance(head, str | Path):
             head = load(head)
         self.expects = Expectation()
+        lead = 0.0
         if isinstance(head, Weights):
             self.expects = head.expects  # the head also sees the intensities
             tau = head.model.assertion.threshold if tau is None else tau
+            lead = head.model.assertion.lead
             head = head.build_head()
 
         assertion = Disagreement() if tau is None else Disagreement(tau)
         point_head = None if head is None else copy.deepcopy(head).cpu().eval()
-        self.model = LateFusion(assertion, point_head)
+        self.model = LateFusion(assertion, point_head, lead)
 
     def __call__(self, points: AnyArray | Scan, f: AnyArray, g: AnyArray) -> Segmentation:
         """Fuse two models' scores of one scan's N points.

@@ -67,8 +67,11 @@ class LabellingRequest:
     @cached_property
     def settings(self) -> dict[str, Any]:
         """The request in JSON types; only a run with equal settings may be resumed."""
+        weights = self.weights.digests()
+        if lead := self.weights.model.assertion.lead:  # decides labels by the same parameters
+            weights["lead"] = str(lead)
         return {
-            "weights": self.weights.digests(),
+            "weights": weights,
             "method": self.method,
             "precision": self.precision,
             # All other engines give equal labels.

@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from amvnet.config.schema import ModelConfig
-from amvnet.models.assertion import Assertion, Disagreement
+from amvnet.models.assertion import Assertion, Disagreement, disputed_points
 from amvnet.models.methods import Ensemble, geometric_mean
 from amvnet.models.point_head import PointHead, nearest_neighbours
 from amvnet.models.polar_net import PolarNet
@@ -52,26 +52,31 @@ class LateFusion(nn.Module):
     """The fusion of any two networks' class probabilities (sections 3.2 and 3.3 of the paper).
 
     Args:
-        point_head: classifies the uncertain points. If it is None, the ensemble of the two
-            networks classifies them.
+        point_head: classifies the disputed points. If it is None, the ensemble of the two networks
+            classifies them.
+        lead: decides which of the uncertain points are disputed; see `disputed_points`.
 
     Attributes:
         ensemble: combines f and g for the certain points, by the geometric mean as in the paper.
         watch: returns the context in which a step runs, to time it; does nothing by default.
     """
 
-    def __init__(self, assertion: Assertion, point_head: PointHead | None) -> None:
+    def __init__(
+        self, assertion: Assertion, point_head: PointHead | None, lead: float = 0.0
+    ) -> None:
         super().__init__()
         self.assertion = assertion
         self.point_head = point_head
+        self.lead = lead
         self.ensemble: Ensemble = geometric_mean
         self.watch: Watch = nullcontext
 
     def fuse(self, batch: PointBatch, f: Tensor, g: Tensor) -> Scores:
         """Return the fusion of f and g: (P, K) class probabilities."""
         uncertain = self.compare(batch, f, g)
-        h = self.refine(batch, f, g, uncertain)
-        y = self.merge(f, g, uncertain, h)
+        disputed = disputed_points(f, g, uncertain, self.lead)
+        h = self.refine(batch, f, g, disputed)
+        y = self.merge(f, g, disputed, h)
         return Scores(y, uncertain, f, g)
 
     def compare(self, batch: PointBatch, f: Tensor, g: Tensor) -> Tensor:
@@ -79,8 +84,8 @@ class LateFusion(nn.Module):
         with self.watch("compare"):
             return self.assertion(f, g, batch.points)
 
-    def refine(self, batch: PointBatch, f: Tensor, g: Tensor, uncertain: Tensor) -> Tensor | None:
-        """Return h: (U, K) class probabilities of the uncertain points; None without a head."""
+    def refine(self, batch: PointBatch, f: Tensor, g: Tensor, disputed: Tensor) -> Tensor | None:
+        """Return h: (U, K) class probabilities of the disputed points; None without a head."""
         if self.point_head is None:
             return None
 
@@ -88,18 +93,18 @@ class LateFusion(nn.Module):
         parts = []
         for scan in batch.slices():
             points = batch.points[scan]
-            index = uncertain[scan].nonzero()[:, 0]  # (U,)
+            index = disputed[scan].nonzero()[:, 0]  # (U,)
             with self.watch("neighbours"):
                 near = nearest_neighbours(points, index, self.point_head.config.neighbours)
             with self.watch("head"):
                 parts.append(self.point_head.classify(points, f[scan], g[scan], index, near))
         return concatenate(parts)
 
-    def merge(self, f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
-        """Return y: (P, K), h for the uncertain points and the ensemble for the others."""
+    def merge(self, f: Tensor, g: Tensor, disputed: Tensor, h: Tensor | None) -> Tensor:
+        """Return y: (P, K), h for the disputed points and the ensemble for the others."""
         with self.watch("merge"):
             y = self.ensemble(f, g)
-            return y if h is None else replace_uncertain(y, uncertain, h)
+            return y if h is None else replace_rows(y, disputed, h)
 
 
 class AMVNet(LateFusion):
@@ -120,8 +125,9 @@ class AMVNet(LateFusion):
         polar_net: nn.Module,
         assertion: Assertion,
         point_head: PointHead | None,
+        lead: float = 0.0,
     ) -> None:
-        super().__init__(assertion, point_head)
+        super().__init__(assertion, point_head, lead)
         self.range_view = range_view
         self.polar_view = polar_view
         self.range_net = range_net
@@ -153,17 +159,17 @@ class AMVNet(LateFusion):
             return grid.to_points(self.polar_net(grid)).float().softmax(dim=1)
 
 
-def replace_uncertain(y: Tensor, uncertain: Tensor, h: Tensor) -> Tensor:
-    """Return y (P, K) with the rows of the U uncertain points replaced by h (U, K).
+def replace_rows(y: Tensor, chosen: Tensor, h: Tensor) -> Tensor:
+    """Return y (P, K) with the rows of the U points that are `chosen` (P,) replaced by h (U, K).
 
     On a CPU, y itself is changed.
     """
     if y.is_cpu:
-        return y.index_put_((uncertain,), h)
+        return y.index_put_((chosen,), h)
 
     # On a GPU, `index_put` would make the CPU wait. On a CPU, it is twice as fast as
     # `masked_scatter`.
-    return y.masked_scatter(uncertain[:, None], h)
+    return y.masked_scatter(chosen[:, None], h)
 
 
 def build_amvnet(config: ModelConfig, classes: int) -> AMVNet:
@@ -175,4 +181,5 @@ def build_amvnet(config: ModelConfig, classes: int) -> AMVNet:
         polar_net=PolarNet(config.polar_net, config.polar_view.vertical, classes),
         assertion=Disagreement(config.assertion.threshold),
         point_head=PointHead(config.point_head, classes),
+        lead=config.assertion.lead,
     )

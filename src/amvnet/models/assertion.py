@@ -39,6 +39,27 @@ class Disagreement:
         return cosine_similarity(f, g) <= self.tau
 
 
+def disputed_points(f: Tensor, g: Tensor, uncertain: Tensor, lead: float) -> Tensor:
+    """Return (P,) bool: the points that the head classifies, among the `uncertain` ones (P,).
+
+    At a disputed point, the networks name different classes by f and g (P, K), or the best class
+    by their geometric mean is at most `lead` times as probable as the second. Elsewhere the head
+    hardly ever changes a label, but takes as much time. With a lead of 0, all uncertain points are
+    disputed, as in the paper.
+    """
+    if not lead:
+        return uncertain
+
+    index = uncertain.nonzero()[:, 0]
+    f, g = f.index_select(0, index), g.index_select(0, index)
+    differs = f.argmax(dim=1) != g.argmax(dim=1)
+    squares = f * g  # of the mean's probabilities
+    is_close = squares * lead**2 >= squares.amax(dim=1, keepdim=True)
+    disputed = uncertain.clone()
+    disputed[index] = differs | (is_close.sum(dim=1) > 1)
+    return disputed
+
+
 def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
     """Return the cosine similarity (P,) of class probabilities f and g (P, K), at most 1."""
     lengths = f.norm(dim=1) * g.norm(dim=1)
