@@ -1,15 +1,20 @@
-// This replaces the viewer's scans.js in viewer.html. The scan comes from the page around this frame.
+// In viewer.html, this takes the place of src/amvnet/viewing/page_assets/scans.js, and has its names. The page around
+// this frame has one scan in `shown`, which is {about, scan} of shown.js.
 "use strict";
 
 const about = aboutOf(JSON.parse(document.getElementById("about").textContent), parent.shown.about);
 
-/** Return what the viewer needs to know: the values of the scan, with the colours of drawings. */
-function aboutOf({ unlabelled, drawn, ...drawing }, shown) {
-  const colors = shown.official.map(({ name, color }) => drawn[shown.taxonomy]?.[name] ?? color);
-  return { ...drawing, ...shown, colors: [unlabelled, ...colors.slice(1)] };
+/**
+ * Return what the viewer needs to know: how it draws, which viewer.html holds, and what shown.js says of the scan.
+ *
+ * Classes have the colours of pages (`drawn`, by the name of the taxonomy), or else those of label files (`official`).
+ */
+function aboutOf({ unlabelled, drawn, ...drawing }, ofScan) {
+  const colors = ofScan.official.map(({ name, color }) => drawn[ofScan.taxonomy]?.[name] ?? color);
+  return { ...drawing, ...ofScan, colors: [unlabelled, ...colors.slice(1)] };
 }
 
-/** Return a promise of the scan: {name, count, center, step, positions, planes: {intensity, rv, ...}}. */
+/** Return a promise of the only scan: {name, count, center, step, positions, planes: {intensity, rv, ...}}. */
 async function scanAt() {
   return parent.shown.scan;
 }

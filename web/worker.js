@@ -1,9 +1,14 @@
 // Read and segment scans in a worker, so that the page stays responsive.
 //
 // The worker takes {id, file, folders, isPreview}: a scan file, and the folders of weights. The first weights are used
-// that are made for the lasers of the scan; if none are, the first ones. It sends messages with the same id: {kind: "began",
-// work}, {kind: "step", title, seconds}, {kind: "shown", ...}, {kind: "labelled", ...} and {kind: "failed", text}. A newer
-// request ends the work on an older one after its step.
+// that are made for the lasers of the scan; if none are, the first ones. It sends messages with the same id:
+//
+//   {kind: "began", work} and {kind: "step", title, seconds}  a step begins, and is done
+//   {kind: "shown", folder, text, ...}  the scan for the viewer (`shownScan`), its weights, and what was assumed of it
+//   {kind: "labelled", verdict, labels, places, total, classes, device, ...}  the same with labels
+//   {kind: "failed", text}
+//
+// A newer request ends the work on an older one after its step.
 
 import { InputError } from "./errors.js";
 import { unpacked } from "./files.js";
@@ -17,11 +22,11 @@ import { shownScan } from "./shown.js";
 const LARGEST_FILE = 200;  // the largest file that is read, megabytes
 const MAX_THREADS = 8;
 let runtime = null, networks = null;
-let newest = 0, last = Promise.resolve();  // the id of the newest request, and the work on all requests
+let newestId = 0, lastWork = Promise.resolve();  // requests are worked on one after the other
 
 addEventListener("message", ({ data }) => {
-  newest = data.id;
-  last = last.then(() => label(data)).catch((error) => {
+  newestId = data.id;
+  lastWork = lastWork.then(() => label(data)).catch((error) => {
     if (!(error instanceof InputError)) console.warn(error);
     const text = error instanceof InputError ? error.message : `This is a fault of the page: ${error.message}`;
     postMessage({ id: data.id, kind: "failed", text });
@@ -32,7 +37,7 @@ async function label({ id, file, folders, isPreview }) {
   const send = (kind, content) => postMessage({ id, kind, ...content });
   const step = async (title, work) => {
     await new Promise((resolve) => setTimeout(resolve));  // newer requests arrive now
-    if (id !== newest) throw new InputError("a newer request");
+    if (id !== newestId) throw new InputError("a newer request");  // the page ignores messages of this id now
     send("began", { work: title });
     const start = performance.now(), result = await work();
     send("step", { title, seconds: (performance.now() - start) / 1000 });
@@ -48,7 +53,7 @@ async function label({ id, file, folders, isPreview }) {
   const run = async () => segment(await load(folder, description, step), scan, step);
   const segmentation = await run().catch(async (error) => {
     if (runtime.device === "wasm" || error instanceof InputError) throw error;
-    runtime = await start("wasm");  // the GPU has failed
+    runtime = await start("wasm");  // what the GPU could not do, the processor can
     networks = null;
     return run();
   });
@@ -58,22 +63,27 @@ async function label({ id, file, folders, isPreview }) {
   send("labelled", { ...shown, verdict, labels, places, total, classes: description.classes, device: runtime.text });
 }
 
-/** Return the first of some folders whose weights know the lasers of a cloud, or the first one, with its scan. */
+/**
+ * Return {folder, description, scan} of the first weights that are made for the lasers of a cloud; if none are, of the
+ * first ones. Weights that do not say for which lasers they are made are taken only if they are the first ones.
+ */
 async function fitting(cloud, folders) {
   let first = null;
   for (const folder of folders) {
     try {
       const description = await readDescription(folder);
       const scan = normalise(cloud, { view: description.range_view, ...description.expects });
-      if (scan.isOwn ?? !first) return { folder, description, scan };
+      const isFirst = !first;
       first ??= { folder, description, scan };
+      if (scan.isMadeFor ?? isFirst) return { folder, description, scan };
     } catch (error) {
-      if (!first || !(error instanceof InputError)) throw error;  // the first weights can label the scan
+      if (!first || !(error instanceof InputError)) throw error;  // else the first weights can label the scan
     }
   }
   return first;
 }
 
+/** Return the bytes of a file as Uint8Array; throw InputError if it is too large or cannot be read. */
 async function bytesOf(file) {
   if (file.size > LARGEST_FILE * 1e6) {
     throw new InputError(

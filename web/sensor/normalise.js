@@ -18,7 +18,7 @@ const SAME_BEAMS = 1.4;  // the largest ratio of two numbers of lasers that are 
 const OWN_ANGLE = 3;  // the largest difference of the ends of the field of view of weights' own sensor, degrees
 
 /**
- * Return {points, rows, places, text, isOwn}. The valid points are normalised (4 n: x, y, z in metres, intensity in
+ * Return {points, rows, places, text, isMadeFor}. The valid points are normalised (4 n: x, y, z in metres, intensity in
  * [0, 1]). With them come their rows in the range image, or null, their places in the cloud, a line on what was assumed,
  * and whether the weights are made for such lasers, or null if they do not say for which.
  *
@@ -42,8 +42,8 @@ export function normalise(cloud, expected) {
   const texts = [map.text, missingText(cloud), negativeText(cloud), ...frameTexts(frame)];
   texts.push(heightText(frame, sensor.height), fault, lasersText(lasers));
   const isLike = isLikeOf(lasers, sensor), text = `assumed ${texts.filter(Boolean).join(", ")}`;
-  const isOwn = isLikeOf(lasers, sensor, OWN_ANGLE);
-  return { count, ...kept, text: isLike === false ? text + strangeText(sensor) : text, isOwn };
+  const isMadeFor = isLikeOf(lasers, sensor, OWN_ANGLE);
+  return { count, ...kept, text: isLike === false ? text + strangeText(sensor) : text, isMadeFor };
 }
 
 /** Return the points (4 n, float32) at finite coordinates that are not the origin, and their places in the cloud. */
