@@ -36,7 +36,7 @@ def test_every_command_of_the_page_runs(
     (few,) = [block for block in PAGE.blocks("yaml") if "structure: {from" in block]
     (tmp_path / "few.yaml").write_text(few)
     changes = Changes(
-        words={"semantickitti-compact": str(recipe), "sim-hdl64e": "init.safetensors"},
+        words={"semantickitti-compact": str(recipe), "sim-any": "init.safetensors"},
         values={
             "simulate": {"--scans": 1},
             "train": {"--training.rv.epochs": 1, "--training.bev.epochs": 1},
