@@ -21,7 +21,7 @@ from amvnet.errors import InputError
 from amvnet.files import alone_in, digest
 from amvnet.inference import map as mapping
 from amvnet.inference.drive import Drives
-from amvnet.inference.listing import list_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.inference.reading import Reading
 from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.lidars import Sensor
@@ -242,7 +242,7 @@ def test_a_map_is_not_resumed_if_anything_is_other_that_its_scores_depend_on(
 ) -> None:
     shutil.copytree(world / "data", tmp_path / "data")
     request = LabellingRequest(fresh_weights(), precision="float32")
-    scans, _ = list_inputs([f"{tmp_path}/data"])
+    scans, _ = find_inputs([f"{tmp_path}/data"]).scans()
     drives = Drives(dict.fromkeys(scans, np.eye(4)))
     moved = Drives({**drives.poses, scans[3]: 2 * np.eye(4)})
     digests = [

@@ -22,7 +22,7 @@ from amvnet.drives.odometry import Odometry, Pair, check_fit
 from amvnet.errors import InputError
 from amvnet.inference import drive as drive_module
 from amvnet.inference.drive import Drives, find_poses
-from amvnet.inference.listing import list_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.inference.pipeline import Pipeline
 from amvnet.sensors.lidars import AXES
 from amvnet.sensors.normalise import Normaliser
@@ -147,7 +147,7 @@ def test_names_of_scans_in_nanoseconds_are_times(
         for index, (points, _) in enumerate(drive_scans(5)):
             stamp = f"{seconds + index:.6f}" if digits else str(round((seconds + index) * 10**9))
             points.tofile(folder / f"{stamp}.bin")
-        scans, _ = list_inputs([str(folder)])
+        scans, _ = find_inputs([str(folder)]).scans()
         if seconds < 1e6 and not digits:
             continue  # as seconds since 1970
         found = find_poses(scans, tmp_path / "tum.txt")
@@ -315,7 +315,7 @@ def without_rotations(poses: Poses) -> Poses:
 def test_poses_that_are_less_exact_than_the_scans_do_not_pass_in_silence(
     world: Path, tmp_path: Path, spoil: Callable[[Poses], Poses]
 ) -> None:
-    scans, _ = list_inputs([f"{world}/data"])
+    scans, _ = find_inputs([f"{world}/data"]).scans()
     lines: list[str] = []
     np.save(tmp_path / "poses.npy", POSES)
     find_poses(scans, tmp_path / "poses.npy", report=lines.append)
@@ -331,7 +331,7 @@ def test_poses_that_are_less_exact_than_the_scans_do_not_pass_in_silence(
 def test_poses_that_were_turned_by_a_calibration_say_so(world: Path, tmp_path: Path) -> None:
     """A refusal names the calibration that is missing, or that does not belong to the poses."""
     shutil.copytree(world / "data/sequences/00/velodyne", tmp_path / "scans")
-    scans, _ = list_inputs([f"{tmp_path}/scans"])
+    scans, _ = find_inputs([f"{tmp_path}/scans"]).scans()
     of_lidar = tmp_path / "poses.txt"
     np.savetxt(of_lidar, POSES[:, :3].reshape(-1, 12))
     lines: list[str] = []
@@ -351,7 +351,7 @@ def test_poses_that_were_estimated_are_not_to_be_estimated(
     world: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(drive_module, "_estimated", lambda *_: stretched(POSES))
-    scans, _ = list_inputs([f"{world}/data"])
+    scans, _ = find_inputs([f"{world}/data"]).scans()
     monkeypatch.setattr(type(scans[0].dataset), "poses", lambda *_: None)
     fails(lambda: find_poses(scans), "KISS-ICP", "give poses, or scans that follow")
     monkeypatch.setattr(type(scans[0].dataset), "poses", lambda *_: stretched(POSES))
@@ -383,7 +383,7 @@ def test_poses_of_ones_own_scans_move_the_points_of_their_files(
     np.savetxt(tmp_path / "poses.txt", kitti)
     report: list[str] = []
     normaliser = Normaliser(fresh_weights().expects)
-    scans, _ = list_inputs([f"{tmp_path}/own.yaml"], normaliser=normaliser)
+    scans, _ = find_inputs([f"{tmp_path}/own.yaml"]).scans(normaliser=normaliser)
     drives = find_poses(scans, report=report.append)
     assert report == ["robot: a drive of 24 scans, 23 m by the dataset"]
     for scan, pose, (points, _) in zip(scans, POSES, drive_scans(), strict=True):
@@ -501,7 +501,7 @@ def test_a_topic_that_does_not_fit_is_one_line_and_nothing_is_written(
 def test_where_poses_of_a_bag_are_estimated_a_line_names_its_odometry(bag: Path) -> None:
     pytest.importorskip("kiss_icp")
     lines: list[str] = []
-    scans, _ = list_inputs([str(bag)])
+    scans, _ = find_inputs([str(bag)]).scans()
     find_poses(scans, report=lines.append)
     assert lines[0].endswith("; --poses /odom takes those of the bag")
     assert "by KISS-ICP" in lines[1]
@@ -537,7 +537,7 @@ def test_the_estimation_of_poses_counts_its_scans(
         write_drive(tmp_path / "data", sequence)
         (tmp_path / f"data/sequences/{sequence}/poses.txt").unlink()
     counts: list[tuple[int, int]] = []
-    scans, _ = list_inputs([f"{tmp_path}/data"])
+    scans, _ = find_inputs([f"{tmp_path}/data"]).scans()
     find_poses(scans, progress=lambda done, total: counts.append((done, total)))
     assert sorted(set(counts)) == [(done, 2 * SCANS) for done in range(2 * SCANS + 1)]
     assert counts == sorted(counts)

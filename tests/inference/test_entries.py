@@ -29,7 +29,7 @@ from amvnet.errors import InputError
 from amvnet.evaluation.scoring import label_by_weights
 from amvnet.inference.calibration import calibration_scans
 from amvnet.inference.fuse import Fusion
-from amvnet.inference.listing import list_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import LateFusion
@@ -224,7 +224,7 @@ def run(command: str) -> None:
 
 
 def by_view(world: World, points: np.ndarray) -> np.ndarray:
-    scans, _ = list_inputs([str(world.write(points))], normaliser=world.normaliser)
+    scans, _ = find_inputs([str(world.write(points))]).scans(normaliser=world.normaliser)
     (shown,) = show_scans(scans, world.segmenter)
     return shown.labels["amvnet"]
 

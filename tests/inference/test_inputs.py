@@ -21,7 +21,7 @@ from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import parse_layout
 from amvnet.data.recordings import Recording
 from amvnet.inference.journal import Entry
-from amvnet.inference.listing import list_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.inference.predict import ADVICE, report_certainty
 from amvnet.inference.reading import array_cloud, array_scan
 from amvnet.scan import Scan
@@ -55,8 +55,8 @@ def write(folder: Path, name: str, sensor: str, height: float, seed: int = 0) ->
 def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]]:
     """Return the normalised scans of a folder, the titles of their sensors, and what was said."""
     lines: list[str] = []
-    inputs, _ = list_inputs(
-        [str(folder)], normaliser=Normaliser(weights_for().expects, report=lines.append)
+    inputs, _ = find_inputs([str(folder)]).scans(
+        normaliser=Normaliser(weights_for().expects, report=lines.append)
     )
     scans = {scan.name: scan.load() for scan in inputs}
     return scans, {scan.name: scan.recording.name for scan in inputs}, lines
@@ -284,7 +284,7 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
     raw = np.fromfile(tmp_path / "a.label", np.uint32)
     np.testing.assert_array_equal(raw, weights.taxonomy.to_raw(expected))
 
-    scans, _ = list_inputs([f"{tmp_path}/a.npy"], normaliser=Normaliser(weights.expects))
+    scans, _ = find_inputs([f"{tmp_path}/a.npy"]).scans(normaliser=Normaliser(weights.expects))
     (shown,) = show_scans(scans, segmenter)
     np.testing.assert_array_equal(shown.labels["amvnet"], expected)
     np.testing.assert_array_equal(segmenter(tmp_path / "a.npy").labels, expected)
@@ -352,7 +352,7 @@ def test_inputs_of_different_classes_are_refused(tmp_path: Path) -> None:
     kitti = make_semantickitti(tmp_path / "kitti").spec
     scan = tmp_path / "scan.pcd.bin"  # the ending of nuScenes
     np.zeros((9, 5), np.float32).tofile(scan)
-    fails(lambda: list_inputs([kitti, str(scan)]), "the same classes")
+    fails(lambda: find_inputs([kitti, str(scan)]).scans(), "the same classes")
 
 
 def test_a_scan_that_was_read_and_moved_has_the_points_that_it_was_moved_to(tmp_path: Path) -> None:
@@ -366,7 +366,7 @@ def test_a_scan_that_was_read_and_moved_has_the_points_that_it_was_moved_to(tmp_
 def test_a_scan_that_is_read_again_is_the_file_as_it_is_then(tmp_path: Path) -> None:
     """A scan that was kept since its sensor was measured is kept no longer than that."""
     path = write(tmp_path, "a", "os1-64", 1.7)
-    (scan,), _ = list_inputs([str(path)], normaliser=Normaliser(weights_for().expects))
+    (scan,), _ = find_inputs([str(path)]).scans(normaliser=Normaliser(weights_for().expects))
     assert len(scan.load()) > 100
     np.save(path, np.load(path)[:100])
     assert len(scan.load()) == 100

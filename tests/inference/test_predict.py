@@ -27,7 +27,7 @@ from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_journals
-from amvnet.inference.listing import list_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.request import LabellingRequest
@@ -615,7 +615,7 @@ def test_a_scan_that_the_system_refuses_is_a_broken_one(
         MAKERS[layout](tmp_path)
     else:
         street(0)[0].tofile(tmp_path / "a.bin")
-    scan, *_ = list_inputs([f"{layout}:{tmp_path}" if layout else str(tmp_path)])[0]
+    scan, *_ = find_inputs([f"{layout}:{tmp_path}" if layout else str(tmp_path)]).scans()[0]
 
     def refuse(path: Path, *arguments: object, **options: object) -> None:
         raise OSError(number, os.strerror(number), str(path))
@@ -628,7 +628,7 @@ def test_that_the_process_has_too_many_files_open_is_no_fault_of_a_scan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     street(0)[0].tofile(tmp_path / "a.bin")
-    (scan,), _ = list_inputs([str(tmp_path)])
+    (scan,), _ = find_inputs([str(tmp_path)]).scans()
 
     def refuse(*arguments: object) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
@@ -672,7 +672,7 @@ def test_scans_that_vanish_during_a_run_are_listed_and_the_others_are_done(
 
 def test_a_scan_that_vanishes_after_it_was_read_has_its_labels(world: Path, tmp_path: Path) -> None:
     make_streets(tmp_path / "data", ("08",), scans=1)
-    (scan,), _ = list_inputs([str(tmp_path / "data")])
+    (scan,), _ = find_inputs([str(tmp_path / "data")]).scans()
     loaded = scan.load()
     ids = np.ones(len(loaded), np.uint8)
     scan.path.unlink()
@@ -719,7 +719,7 @@ def test_scans_are_labelled_again_if_a_description_says_something_else_of_how_th
     ):
         path = tmp_path / "own.yaml"
         path.write_text(f"scans: scans/*.bin\nclasses: {{road: 1}}\n{says}\n")
-        scans, _ = list_inputs([str(path)])
+        scans, _ = find_inputs([str(path)]).scans()
         digests.append(request.digest_of(scans, None))
         origins.append(tuple(Pipeline(scans, lambda *_: [], output)._origins.values()))
     assert len(set(digests)) == len(set(origins)) == 5

@@ -19,7 +19,7 @@ from amvnet.errors import InputError
 from amvnet.evaluation.analysis import analyze
 from amvnet.evaluation.label_errors import rank
 from amvnet.evaluation.scoring import evaluate, label_by_weights
-from amvnet.inference.listing import list_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmenter import Segmenter
 from amvnet.runtime.memory import available_memory
@@ -128,7 +128,7 @@ def _ranked(dataset: Dataset, segmenter: Segmenter) -> Any:
 
 
 def _viewed(dataset: Dataset, segmenter: Segmenter) -> Any:
-    scans, _ = list_inputs([dataset.spec])
+    scans, _ = find_inputs([dataset.spec]).scans()
     shown = show_scans(scans, segmenter)
     return [[each.name, each.labels["amvnet"].tolist()] for each in shown]
 

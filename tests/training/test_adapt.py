@@ -15,7 +15,7 @@ import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.drives.consensus import Consensus, DriveScan
 from amvnet.inference.drive import TURN, find_poses
-from amvnet.inference.listing import list_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.training import adapt as adapting
 from amvnet.training.adapt import (
     FIGURES,
@@ -119,7 +119,7 @@ def test_drives_whose_names_are_alike_teach_by_labels_of_their_own(
         write_drive(Path(root), scans=2, seed=index)
     segmenter = amvnet.load(world / "w.safetensors")
     for inputs in (["x/y", "x_y"], ["A", "B"]):
-        scans, _ = list_inputs(inputs, taxonomy=segmenter.taxonomy)
+        scans, _ = find_inputs(inputs).scans(taxonomy=segmenter.taxonomy)
         labels_of = Path(f"{inputs[0]}.labels")
         teach(scans, None, segmenter, labels_of)
         taught = TaughtScans(scans, labels_of, segmenter.weights)
@@ -141,7 +141,7 @@ def test_two_datasets_with_a_sequence_of_one_name_are_two_drives(tmp_path: Path)
     poses = tmp_path / "B/sequences/00/poses.txt"
     np.savetxt(poses, np.loadtxt(poses) + np.eye(12)[3])  # it began a metre farther right
     lines: list[str] = []
-    scans, _ = list_inputs([f"{tmp_path}/A", f"{tmp_path}/B"])
+    scans, _ = find_inputs([f"{tmp_path}/A", f"{tmp_path}/B"]).scans()
     drives = find_poses(scans, report=lines.append)
     assert [line.partition(",")[0] for line in lines] == [
         "00: a drive of 3 scans",

@@ -161,7 +161,7 @@ class CloudSegmenter:
             origin = Message.of(message)
 
         if self.taxonomy is None:
-            from amvnet.inference.choosing import choose_by
+            from amvnet.inference.loading import choose_by
 
             name, reason = choose_by(cloud, self._sensor)
             self._report(f"weights {name}, {reason}")

@@ -166,20 +166,6 @@ def find_inputs(specs: Sequence[str], options: ScanOptions = ScanOptions()) -> I
     return Inputs(parts, options)
 
 
-def list_inputs(
-    inputs: Sequence[str],
-    options: ScanOptions = ScanOptions(),
-    taxonomy: Taxonomy | None = None,
-    normaliser: Normaliser | None = None,
-) -> tuple[list[ScanFile], Taxonomy]:
-    """List the scans of all inputs, recording by recording, as `Inputs.scans` returns them.
-
-    Raises:
-        InputError: as `find_inputs` and `Inputs.scans`.
-    """
-    return find_inputs(inputs, options).scans(taxonomy, normaliser)
-
-
 class Scans(Sequence[Scan]):
     """The scans of a file, a bag, a folder or a dataset; each is read when it is asked for."""
 
@@ -241,5 +227,5 @@ def read_all(path: Path | str, topic: str | None = None) -> Scans:
     Raises:
         InputError: if there is no scan.
     """
-    scans, _ = list_inputs([str(path)], ScanOptions(reading=Reading(topic=topic)))
+    scans, _ = find_inputs([str(path)], ScanOptions(reading=Reading(topic=topic))).scans()
     return Scans(path, scans)

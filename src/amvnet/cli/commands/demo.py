@@ -38,7 +38,7 @@ def demo(
     from amvnet.data.taxonomy import CLASSES_BY_SENSOR, SEMANTICKITTI
     from amvnet.errors import InputError
     from amvnet.evaluation.metrics import REPORT
-    from amvnet.inference.listing import list_inputs
+    from amvnet.inference.listing import find_inputs
     from amvnet.inference.loading import load
     from amvnet.outputs import check_outputs
     from amvnet.sensors.built_in import lasers_of, weights_for
@@ -67,7 +67,7 @@ def demo(
             data, sensor=sensors[0], sequences=SEQUENCES, scans=SCANS, seed=seed, progress=step
         )
 
-    scans, taxonomy = list_inputs([str(data)], taxonomy=segmenter.taxonomy)
+    scans, taxonomy = find_inputs([str(data)]).scans(taxonomy=segmenter.taxonomy)
     with progress("segmenting") as step:
         shown = show_scans(scans, segmenter, progress=step)
         first = list(islice(shown, FIRST))
