@@ -58,7 +58,7 @@ class SemanticKitti(Dataset):
         return {**splits, "all": present}
 
     def lacks(self, split: str) -> str:
-        """Return the error that names the sequences of a split, and those on disk."""
+        """Return the message that names the sequences of a split, and those on disk."""
         present = self._sequences_on_disk()
         unseen = [name for name in present if name not in self.taxonomy.splits["train"]]
         return (

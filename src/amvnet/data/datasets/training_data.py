@@ -293,7 +293,7 @@ def named_sequences(
 def _too_few(
     dataset: Dataset, split: Split, train: Sequence[str] | None, val: Sequence[str] | None
 ) -> str:
-    """Return the error that says why no sequence is left to train on or to validate with."""
+    """Return the message that says why no sequence is left to train on or to validate with."""
     if not split.having_labels(split.part("all")):
         dataset.labelled(dataset.records(split.part("all")))  # raises
     trainable = split.trainable

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -130,7 +130,7 @@ def named_cloud(
 
     arrays = {}
     for key, index in find_columns(names).items():
-        arrays[key] = values = columns[index]
+        values = columns[index]
         if values.ndim != 1 or values.dtype.kind not in "fiu":
             found = (
                 f"{values.dtype} of shape {values.shape[1:]}" if values.ndim > 1 else values.dtype
@@ -139,9 +139,8 @@ def named_cloud(
                 f"{name}: expected a number for each point in the column {names[index]!a}, found "
                 f"{found}; convert the column"
             )
-
-    cloud = make_cloud(arrays, name)
-    return Cloud(cloud.xyz, cloud.intensity, cloud.ring, name, note=note)
+        arrays[key] = values
+    return replace(make_cloud(arrays, name), note=note)
 
 
 def name_columns(table: np.ndarray) -> tuple[str, ...]:
