@@ -101,8 +101,8 @@ def test_the_labels_come_last_into_a_bucket(
 def test_labels_in_a_folder_are_those_of_predict_in_each_format(
     labelling: LabellingRequest, fleet: Path, tmp_path: Path
 ) -> None:
-    options: dict[str, Any] = {"kind": "ply", "scores": True, "uncertain": True}
-    label(replace(labelling, **options), str(tmp_path / "out"), [f"{fleet}/scans"])
+    request = replace(labelling, files=LabelFiles("ply", True, True))
+    label(request, str(tmp_path / "out"), [f"{fleet}/scans"])
     succeed(
         f"predict '{fleet}/scans/*/*.bin' --weights {fleet}/w.safetensors --out {tmp_path}/whole "
         "--format ply --scores --uncertain"
