@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 import amvnet
 import amvnet.engines.base
+import amvnet.models.amvnet
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
@@ -99,6 +100,11 @@ def without_sharing() -> None:
     PointHead.classify = classify  # type: ignore[method-assign]
 
 
+def without_lead() -> None:
+    """Let the head classify all uncertain points."""
+    amvnet.models.amvnet.disputed_points = lambda f, g, uncertain, lead: uncertain
+
+
 UNCHANGED = "unchanged"
 ALL = "all of these"
 REMOVALS: dict[str, Callable[[], None]] = {
@@ -109,6 +115,7 @@ REMOVALS: dict[str, Callable[[], None]] = {
     "coarse maps upsampled before convolutions": without_joining,
     "neighbours by SciPy": without_pykdtree,
     "head's first layer once a neighbour": without_sharing,
+    "head for all uncertain points": without_lead,
 }
 
 

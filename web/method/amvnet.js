@@ -28,12 +28,12 @@ export async function segment(networks, { points, rows }, step) {
 
   const { rv: f, bev: g } = scores;
   const similarity = await step("compare", () => similarityOf(f, g, k));
-  const threshold = Math.fround(description.assertion.threshold);
-  const uncertain = Uint8Array.from(similarity, (value) => value <= threshold);
+  const { lead, threshold } = description.assertion, tau = Math.fround(threshold);
+  const uncertain = Uint8Array.from(similarity, (value) => value <= tau);
   scores.ensemble = await step("mean of both", () => geometricMean(f, g));
 
   if (method === "amvnet") {
-    const index = disputedOf(f, g, k, uncertain, description.assertion.lead), n = description.point_head.neighbours;
+    const index = disputedOf(f, g, k, uncertain, lead), n = description.point_head.neighbours;
     const neighbours = await step("neighbours", () => (index.length ? nearestOthers(points, index, n) : index));
     const head = await step("point head", () => classify(networks, { points, f, g, disputed: index, neighbours }));
     scores.amvnet = await step("merge", () => merged(scores.ensemble, index, head, k));

@@ -4,17 +4,11 @@ const TINY = 1e-12;  // the least divisor, which keeps quotients finite
 
 /** Return the cosine similarity (n) of the networks' probabilities. */
 export function similarityOf(f, g, k) {
-  const similarity = new Float32Array(f.length / k);
-  for (let i = 0; i < similarity.length; i++) {
+  return Float32Array.from({ length: f.length / k }, (_, i) => {
     let ff = 0, gg = 0, fg = 0;
-    for (let place = i * k; place < (i + 1) * k; place++) {
-      ff += f[place] * f[place];
-      gg += g[place] * g[place];
-      fg += f[place] * g[place];
-    }
-    similarity[i] = Math.min(fg / Math.sqrt(Math.max(ff * gg, TINY)), 1);
-  }
-  return similarity;
+    for (let at = i * k; at < (i + 1) * k; at++) { ff += f[at] * f[at]; gg += g[at] * g[at]; fg += f[at] * g[at]; }
+    return Math.min(fg / Math.sqrt(Math.max(ff * gg, TINY)), 1);
+  });
 }
 
 /**
@@ -22,17 +16,12 @@ export function similarityOf(f, g, k) {
  * the best class of the mean is at most `lead` times as probable as the second. With a lead of 0, they are all uncertain points.
  */
 export function disputedOf(f, g, k, uncertain, lead) {
-  const all = Uint32Array.from(uncertain.keys()).filter((i) => uncertain[i]), squared = Math.fround(lead ** 2);
-  return !lead ? all : all.filter((i) => {
-    let inF = i * k, inG = i * k, best = -1, second = -1;  // places of the largest; squares of the mean's probabilities
-    for (let place = i * k; place < (i + 1) * k; place++) {
-      if (f[place] > f[inF]) inF = place;
-      if (g[place] > g[inG]) inG = place;
-      const square = Math.fround(f[place] * g[place]);
-      if (square > best) [best, second] = [square, best];
-      else if (square > second) second = square;
-    }
-    return inF !== inG || Math.fround(second * squared) >= best;
+  return Uint32Array.from(uncertain.keys()).filter((i) => {
+    if (!uncertain[i] || !lead) return uncertain[i];
+    const [ofF, ofG] = [f, g].map((values) => values.subarray(i * k, (i + 1) * k));
+    const squares = ofF.map((value, c) => value * ofG[c]).sort();  // of the mean's probabilities, the largest last
+    const isClose = Math.fround(squares[k - 2] * Math.fround(lead ** 2)) >= squares[k - 1];
+    return isClose || labelsOf(ofF, k)[0] !== labelsOf(ofG, k)[0];
   });
 }
 
@@ -50,11 +39,8 @@ export function merged(mean, disputed, head, k) {
 
 /** Return the id (n) of the most probable class, 1 to K. */
 export function labelsOf(scores, k) {
-  const labels = new Uint8Array(scores.length / k);
-  for (let i = 0; i < labels.length; i++) {
-    let best = i * k;
-    for (let place = best + 1; place < (i + 1) * k; place++) if (scores[place] > scores[best]) best = place;
-    labels[i] = best - i * k + 1;
-  }
-  return labels;
+  return Uint8Array.from({ length: scores.length / k }, (_, i) => {
+    const row = scores.subarray(i * k, (i + 1) * k);
+    return 1 + row.reduce((best, value, c) => (value > row[best] ? c : best), 0);
+  });
 }
