@@ -74,14 +74,14 @@ def main() -> None:
             f, g = torch.from_numpy(result.rv), torch.from_numpy(result.bev)
             uncertain = torch.from_numpy(result.uncertain)
             ensemble = (f * g).argmax(dim=1).numpy() + 1
-            counts["points"] += np.count_nonzero(result.labels)
+            counts["points"] += int(np.count_nonzero(result.labels))
             counts["uncertain"] += int(uncertain.sum())
             ids = {}
             for lead in leads:
                 disputed = disputed_points(f, g, uncertain, lead).numpy()
                 labels = np.where(result.uncertain & ~disputed, ensemble, result.labels)
-                counts[f"disputed {lead}"] += np.count_nonzero(disputed)
-                counts[f"changed {lead}"] += np.count_nonzero(labels != result.labels)
+                counts[f"disputed {lead}"] += int(np.count_nonzero(disputed))
+                counts[f"changed {lead}"] += int(np.count_nonzero(labels != result.labels))
                 ids[str(lead)] = labels
             evaluation.add(scan.points, scan.labels, ids)
         if counts["points"]:

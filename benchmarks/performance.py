@@ -26,7 +26,6 @@ from torch.nn import functional as F
 
 import amvnet
 import amvnet.engines.base
-import amvnet.models.amvnet
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
@@ -35,9 +34,11 @@ from amvnet.data.labels.ids import write_ids
 from amvnet.engines.compute import ONNX_ENGINES
 from amvnet.engines.onnx import OnnxGraph
 from amvnet.inference.timing import FUSION, MEAN, STAGES, run_once
+from amvnet.models.amvnet import LateFusion, Scores
 from amvnet.models.layers import upsample
 from amvnet.models.point_head import PointHead, head_features, point_table
 from amvnet.models.polar_net import PolarNet
+from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid
 from lidarstreets import simulate
 
@@ -102,7 +103,13 @@ def without_sharing() -> None:
 
 def without_lead() -> None:
     """Let the head classify all uncertain points."""
-    amvnet.models.amvnet.disputed_points = lambda f, g, uncertain, lead: uncertain
+    fuse = LateFusion.fuse
+
+    def fuse_all(self: LateFusion, batch: PointBatch, f: Tensor, g: Tensor) -> Scores:
+        self.lead = 0.0
+        return fuse(self, batch, f, g)
+
+    LateFusion.fuse = fuse_all  # type: ignore[method-assign]
 
 
 UNCHANGED = "unchanged"
