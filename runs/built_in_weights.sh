@@ -7,7 +7,8 @@
 # 6,000 scans of 1,000 streets, and each epoch has other streets. With "any", it has as many scans again,
 # each of another sensor that is drawn, so that the networks stay good at an HDL-64E. A network takes 0.5 to 1 s for a scan on
 # a CPU core, and 4 minutes for an epoch on an H100. docs/log.md says how the training of the shipped
-# weights differed.
+# weights differed. Weights of an earlier recipe take a value that needs no training by runs/set_values.py:
+# python runs/set_values.py OUT/head/weights.safetensors assertion.lead 2.5
 set -euo pipefail
 sensor=$1 out=$2
 shift 2

@@ -62,6 +62,7 @@ def test_the_semantickitti_recipe_holds_the_papers_numbers() -> None:
     assert (grid.radius_max, grid.z_min, grid.z_max) == (50.0, -3.0, 1.5)
 
     assert recipe.model.assertion.threshold == 0.85
+    assert recipe.model.assertion.lead == 0  # also of weights that do not name it
     assert recipe.model.point_head.neighbours == 15
 
     training = recipe.training
