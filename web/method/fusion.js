@@ -39,8 +39,6 @@ export function merged(mean, disputed, head, k) {
 
 /** Return the id (n) of the most probable class, 1 to K. */
 export function labelsOf(scores, k) {
-  return Uint8Array.from({ length: scores.length / k }, (_, i) => {
-    const row = scores.subarray(i * k, (i + 1) * k);
-    return 1 + row.reduce((best, value, c) => (value > row[best] ? c : best), 0);
-  });
+  const largest = (row) => row.reduce((best, value, c) => (value > row[best] ? c : best), 0);
+  return Uint8Array.from({ length: scores.length / k }, (_, i) => 1 + largest(scores.subarray(i * k, (i + 1) * k)));
 }
