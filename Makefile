@@ -12,6 +12,9 @@ printf '%s\n' "type next:" "  source .venv/bin/activate   # once in each shell, 
     "  amvnet predict scan.bin     # label a scan of yours"
 endef
 
+# Said before anything is downloaded; pip would say it after PyTorch.
+CHECK_PYTHON := import sys; sys.version_info >= (3, 11) or sys.exit("expected Python 3.11 or newer, found " + sys.version.split()[0] + "; make install PYTHON=python3.12")
+
 .PHONY: install demo test test-full all-tests bench gpu docs style lint format release clean
 
 install: .venv/installed  ## the package and all that its tests need, in .venv
@@ -59,6 +62,8 @@ release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushin
 
 # torch is installed first and alone, with a pinned version, so that no other build of it is installed.
 .venv/installed: pyproject.toml constraints.txt
+	@command -v $(PYTHON) > /dev/null || { echo "expected Python 3.11 or newer, found no $(PYTHON); make install PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c '$(CHECK_PYTHON)'
 	@echo "installing PyTorch in .venv: a minute, or several with a slow connection"
 	@$(PYTHON) -m venv .venv
 	@$(PIP) torch

@@ -1,18 +1,19 @@
-"""The targets with which a user begins end with what to type next."""
+"""The targets with which a user begins check Python first, and end with what to type next."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 
 
-@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 @pytest.mark.parametrize("target", ["install", "demo"])
 def test_a_target_ends_with_the_line_that_activates_the_environment(
     target: str, tmp_path: Path
@@ -32,3 +33,29 @@ def test_a_target_ends_with_the_line_that_activates_the_environment(
     lines = subprocess.check_output(make, cwd=tmp_path, text=True).splitlines()
     assert lines[-2].split("#")[0].strip() == "source .venv/bin/activate"
     assert lines[-1].split("#")[0].strip() == "amvnet predict scan.bin"
+
+
+@pytest.mark.parametrize("version", ["2.7.18", "3.10.13", None])
+def test_an_old_or_missing_python_is_refused_before_anything_is_installed(
+    version: str | None, tmp_path: Path
+) -> None:
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    for name in ("pyproject.toml", "constraints.txt"):
+        (tmp_path / name).touch()
+    python = tmp_path / "python"
+    if version is not None:
+        numbers = tuple(map(int, version.split(".")))
+        pretend = f"import sys; sys.version_info = {numbers}; sys.version = '{version} (old)'"
+        python.write_text(
+            f'#!/bin/sh\nexec {sys.executable} -c "{pretend}; exec(sys.argv[1])" "$2"\n'
+        )
+        python.chmod(0o755)
+
+    make = ["make", "--no-print-directory", "install", f"PYTHON={python}"]
+    done = subprocess.run(make, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert done.stdout == ""
+    found = version or f"no {python}"
+    line = f"expected Python 3.11 or newer, found {found}; make install PYTHON=python3.12"
+    assert done.stderr.splitlines()[0] == line
+    assert not (tmp_path / ".venv").exists()
