@@ -402,19 +402,26 @@ def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) 
 ENTRIES = [Entry(name, "0f", "drive", 10, 3, [1]) for name in "ab"]
 
 
-def test_the_folder_of_another_run_takes_other_scans_only_if_told_so(
+def test_a_folder_takes_other_scans_of_a_run_with_other_settings_only_if_told_so(
     world: Path, tmp_path: Path
 ) -> None:
     command = f"--weights {world}/{WEIGHTS} --out {tmp_path}"
     succeed(f"predict {world}/scans/000000.bin {command}")
+    succeed(f"predict {world}/scans/000001.bin {command}")
+    assert read_journals(tmp_path).entries.keys() == {"000000.npz", "000001.npz"}
 
-    other = f"predict {world}/scans/000001.bin {command}"
+    other = f"predict {world}/scans/000002.bin {command}"
     before = files(tmp_path)
-    refused(other, "1 scan of an earlier run")
+    refused(f"predict {world}/scans/000001.bin {command}", "000001.label", "found one")
+    for option in ("--method rv", "--drive"):
+        refused(f"{other} {option}", "2 scans of an earlier run")
     assert files(tmp_path) == before
+    (tmp_path / JOURNAL).rename(tmp_path / UNFINISHED)
+    refused(other, "2 scans of an earlier run")
     succeed(f"{other} --resume")
-    succeed(f"predict {world}/scans/000002.bin {command} --overwrite --method rv")
-    assert {f"00000{index}.label" for index in range(3)} <= files(tmp_path)
+    assert read_journals(tmp_path).entries.keys() == {f"00000{index}.npz" for index in range(3)}
+    succeed(f"predict {world}/scans/000003.bin {command} --overwrite --method rv")
+    assert {f"00000{index}.label" for index in range(4)} <= files(tmp_path)
 
 
 def test_the_end_counts_the_classes_of_the_label_files_and_names_commands_that_run(

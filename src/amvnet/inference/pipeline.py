@@ -146,7 +146,7 @@ class Pipeline:
         """
         folder = self.output.folder
         with alone_in(folder):
-            check_output(self.scans, self.output)  # another run may have ended meanwhile
+            check_output(self.scans, self.output, settings)  # another run may have ended meanwhile
             kept = self._kept(settings)
             remaining = {scan for scan in self.scans if _key(scan) not in kept}
 
@@ -342,25 +342,34 @@ def check_faults(faults: Sequence[str], total: int) -> None:
         )
 
 
-def check_output(scans: Sequence[ScanFile], output: OutputOptions) -> None:
+def check_output(
+    scans: Sequence[ScanFile], output: OutputOptions, settings: Mapping[str, Any] | None = None
+) -> None:
     """Check that the files of some scans may be written; call this before any long work.
 
-    The files of the run that is resumed may be replaced.
+    The files of the run that is resumed may be replaced. The labels of other scans, of an earlier
+    run that has ended, stay beside the new ones if both runs have the same settings.
+
+    Args:
+        settings: as `Pipeline.run` takes them; None if they are unknown.
 
     Raises:
         InputError: if two scans would have the same files, a scan and its output would have the
             same folder, a file may not be written, or the folder has other scans' labels of an
-            earlier run, which is neither resumed nor overwritten.
+            earlier run with other settings, which is neither resumed nor overwritten.
     """
     folder = output.folder
-    earlier = read_journals(folder).entries
+    run = read_journals(folder)
+    earlier = run.entries
     _check_names(scans)
     others = earlier.keys() - {_key(scan) for scan in scans}
-    if others and not (output.resume or output.overwrite):
+    is_unlike = settings is None or run.changed(settings) or (folder / UNFINISHED).exists()
+    if others and is_unlike and not (output.resume or output.overwrite):
         raise InputError(
             f"{folder}: expected a new folder, found the labels of {counted(len(others), 'scan')} "
-            "of an earlier run; write to another folder, or say --resume to go on with that run, "
-            "or --overwrite to keep its labels beside the new ones"
+            "of an earlier run that is unfinished or has other settings; write to another folder, "
+            "or say --resume to go on with that run, or --overwrite to keep its labels beside the "
+            "new ones"
         )
     inputs = list(output.also_read)
     own_files: list[Path] = []

@@ -60,7 +60,7 @@ def predict(
     """
     classes = request.classes
     scans = inputs.for_weights(request.weights, report, official=True)
-    check_output(scans, output)
+    check_output(scans, output, request.settings if drive is None else None)
     drives = None
     if drive is not None:
         with progress("poses") as step:
