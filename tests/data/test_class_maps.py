@@ -14,7 +14,7 @@ from amvnet.data.class_maps import BUILT_IN, class_map
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.weights.file import save
 
-from fixtures.commands import fails, refusal, succeed
+from fixtures.commands import fails, refusal, refused, succeed
 from fixtures.tiny import GOLDEN, fresh_weights, make_streets
 
 EQUAL = {  # classes of SemanticKITTI and of nuScenes that each built-in map takes for the same
@@ -71,6 +71,28 @@ def test_a_users_map_may_leave_classes_out_and_choose_the_ids(tmp_path: Path) ->
 
 def fake_taxonomy() -> Taxonomy:
     return Taxonomy("fake", ("cat",), ((0, 0, 0), (1, 1, 1)), {0: 0, 1: 1}, (0, 1), {}, False)
+
+
+def test_a_misspelt_class_in_a_map_is_refused_by_every_command(tmp_path: Path) -> None:
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    data = make_streets(tmp_path / "data")
+    out = tmp_path / "out"
+    for classes, words in (
+        ({"road": ["road", "parkin"]}, ("road", "found 'parkin'", "did you mean parking?")),
+        ({"road": ["road"], "persn": []}, ("found 'persn'", "did you mean person?")),
+    ):
+        path = write_map(tmp_path / "few.yaml", classes)
+        options = ("--weights", weights, "--classes", path)
+        refused(("evaluate", data, *options), path, *words)
+        refused(("evaluate", data, "--predictions", data, "--classes", path), path, *words)
+        refused(("predict", data, *options, "--out", out), path, *words)
+        assert not out.exists()
+
+
+def test_a_map_may_name_classes_of_the_data_and_of_other_benchmarks(tmp_path: Path) -> None:
+    path = write_map(tmp_path / "few.yaml", {"animal": ["cat"], "ground": ["driveable_surface"]})
+    assert class_map(str(path), fake_taxonomy()).table(fake_taxonomy()).tolist() == [0, 1]
+    fails(lambda: class_map(str(path)), path, "animal", "'cat'")
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset
     from amvnet.data.datasets.training_data import Source
     from amvnet.data.recordings import ScanFile
+    from amvnet.data.taxonomy import Taxonomy
     from amvnet.inference.drive import DriveOptions
     from amvnet.inference.listing import Inputs, ScanOptions
     from amvnet.inference.reading import Reading
@@ -217,13 +218,14 @@ class LabelChoice:
     uncertain: bool = False
     """also write NAME.uncertain.npy, which marks the points on which the two networks disagree."""
 
-    def parse(self, weights: Weights, reading: Reading, compute: Compute) -> LabellingRequest:
-        """Return the request for labels by some weights.
+    def parse(
+        self, weights: Weights, reading: Reading, compute: Compute, *of_data: Taxonomy
+    ) -> LabellingRequest:
+        """Return the request for labels by some weights, of data that may have classes.
 
         Raises:
             InputError: if a value cannot be parsed, or does not fit the weights.
         """
-        from amvnet.data.class_maps import class_map
         from amvnet.inference.pipeline import LabelFiles
         from amvnet.inference.request import LabellingRequest
 
@@ -234,7 +236,7 @@ class LabelChoice:
             precision=compute.precision,
             engine=compute.engine,
             reading=reading,
-            classes=None if self.classes is None else class_map(self.classes),
+            classes=map_to(self.classes, weights.taxonomy, *of_data),
             files=LabelFiles(self.format, self.scores, self.uncertain),
         )
 
@@ -354,15 +356,14 @@ def load_for(inputs: Inputs, weights: str, then: str = "") -> tuple[str, Weights
 
 
 def load_dataset(
-    data: str, weights: str, mapping: ClassMap | None = None
+    data: str, weights: str, any_classes: bool = False
 ) -> tuple[str, Weights, Dataset]:
     """Return the weights for a dataset by `load_for`, and the dataset, normalised to them.
 
     Lines report what is assumed of its sensors.
 
     Args:
-        mapping: maps the classes of the dataset and of the weights to others, so that they may
-            differ.
+        any_classes: whether the dataset may have other classes than the weights.
 
     Raises:
         InputError: if there are no such weights or no such dataset, or it has other classes.
@@ -373,9 +374,16 @@ def load_dataset(
 
     dataset = open_dataset(data)
     name, loaded = load_for(Inputs([dataset]), weights)
-    if mapping is None:
+    if not any_classes:
         dataset = with_classes(dataset, loaded.taxonomy)
     return name, loaded, normalised(dataset, Normaliser(loaded.expects, report=report))
+
+
+def map_to(classes: str | None, *taxonomies: Taxonomy) -> ClassMap | None:
+    """Return the map of `--classes`, or None without one; the errors are those of `class_map`."""
+    from amvnet.data.class_maps import class_map
+
+    return None if classes is None else class_map(classes, *taxonomies)
 
 
 def method_for(weights: Weights, method: MethodName = "amvnet") -> MethodName:

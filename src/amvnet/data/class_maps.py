@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from amvnet.config.yaml_files import parse_yaml, read_yaml
-from amvnet.data.taxonomy import Taxonomy, class_entries, user_taxonomy
-from amvnet.errors import InputError, errors_of, shown
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, class_entries, user_taxonomy
+from amvnet.errors import InputError, did_you_mean, errors_of, shown
 
 BUILT_IN = ("coarse", "lidog")  # the maps in files of this package, by name
 
@@ -49,8 +49,16 @@ class ClassMap:
         return np.array(train_ids, dtype=np.uint8)
 
 
-def class_map(name: str) -> ClassMap:
-    """Return a built-in map or the map in a YAML file; raise InputError if there is none."""
+def class_map(name: str, *taxonomies: Taxonomy) -> ClassMap:
+    """Return a built-in map or the map in a YAML file.
+
+    Args:
+        taxonomies: the classes of the weights and of the data.
+
+    Raises:
+        InputError: if there is no such map, or it names a class that neither these nor a benchmark
+            have. A map may also be for benchmarks that are not in use.
+    """
     if name in BUILT_IN:
         text = (resources.files("amvnet.data") / f"{name}.yaml").read_text(encoding="utf-8")
         return _parse(name, parse_yaml(text, name))
@@ -63,7 +71,22 @@ def class_map(name: str) -> ClassMap:
         )
 
     with errors_of(path):
-        return _parse(path.stem, read_yaml(path, "a map of classes"))
+        mapping = _parse(path.stem, read_yaml(path, "a map of classes"))
+        _check_names(mapping, (*taxonomies, *TAXONOMIES.values()))
+        return mapping
+
+
+def _check_names(mapping: ClassMap, taxonomies: Iterable[Taxonomy]) -> None:
+    """Raise InputError if a map names a class that no taxonomy has, or nothing becomes a class."""
+    known = {name for taxonomy in taxonomies for name in taxonomy.classes}
+    for train_id, title in enumerate(mapping.target.classes, start=1):
+        names = [name for name, target in mapping.sources.items() if target == train_id]
+        for name in names or [title]:
+            if name not in known:
+                raise InputError(
+                    f"{title}: expected classes of the weights or of the data, found {name!r}"
+                    f"{did_you_mean(name, sorted(known))}"
+                )
 
 
 def _parse(name: str, tree: Any) -> ClassMap:

@@ -56,6 +56,11 @@ class Inputs:
         self._options = options
         self._known: tuple[Recording, Estimate | None] | None = None  # what chose the weights
 
+    @property
+    def taxonomies(self) -> list[Taxonomy]:
+        """The classes of the datasets among the inputs."""
+        return [part.taxonomy for part in self._parts if not isinstance(part, ScanFiles)]
+
     def choose_weights(self) -> tuple[str, str]:
         """Return the name of built-in weights for the first recording, and in words why these.
 

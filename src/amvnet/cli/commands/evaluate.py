@@ -14,6 +14,7 @@ from amvnet.cli.options import (
     join_processes,
     load_dataset,
     load_segmenter,
+    map_to,
 )
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
@@ -65,7 +66,6 @@ def evaluate(
             maps the classes of the data and of the weights to them.
         overwrite: replace figures and drawings that exist.
     """
-    from amvnet.data.class_maps import class_map
     from amvnet.data.datasets.open import open_dataset
     from amvnet.engines.precision import choose_device
     from amvnet.evaluation.metrics import REPORT
@@ -83,11 +83,11 @@ def evaluate(
 
     processes = join_processes()
     drives = None
-    mapping = None if classes is None else class_map(classes)
     if weights is not None and predictions is not None:
         raise InputError("expected --weights or --predictions, found both; give one of them")
     if predictions is None:
-        weights, loaded, dataset = load_dataset(data, weights or AUTO, mapping)
+        weights, loaded, dataset = load_dataset(data, weights or AUTO, classes is not None)
+        mapping = map_to(classes, loaded.taxonomy, dataset.taxonomy)
         records = choice.records(dataset)
         check_files(records)
         drives = _find_drives(drive_choice, dataset, records, processes.size)
@@ -105,6 +105,7 @@ def evaluate(
                     f"{flag}: expected --weights, found --predictions; leave {flag} out"
                 )
         dataset = open_dataset(data)
+        mapping = map_to(classes, dataset.taxonomy)
         records = choice.records(dataset)
         check_files(records)
         labeller = label_from_files(dataset, predictions, mapping)

@@ -72,7 +72,7 @@ def predict(
     drive = drive_choice.parse()
     where = f"; labels go to {out}"
     found, weights, loaded = open_inputs(inputs, choice, sensor_choice, weights, where)
-    request = labels.parse(loaded, found.reading, compute)
+    request = labels.parse(loaded, found.reading, compute, *found.taxonomies)
     is_new = not (Path(out) / JOURNAL).exists()
     also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, drive_choice.poses)
 
