@@ -54,7 +54,7 @@ def site(tmp_path: Path) -> Path:
 
 def test_a_missing_yaml_file_is_not_called_a_folder(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
-    fails(lambda: open_dataset(str(path)), path, "(YAML)", "check the path")
+    fails(lambda: open_dataset(str(path)), path, "(YAML), found no such file; check the path")
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.int64])

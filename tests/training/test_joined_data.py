@@ -351,7 +351,7 @@ def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
 
 
 def test_a_fine_tuning_needs_weights(world: Path, tmp_path: Path) -> None:
-    refused(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}", "--init")
+    refused(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}", "add --init sim-any")
 
 
 def test_all_sequences_of_another_dataset_are_mixed_in_if_it_has_no_split(tmp_path: Path) -> None:

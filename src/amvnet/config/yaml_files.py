@@ -38,6 +38,8 @@ def read_yaml(path: Path, content: str) -> Any:
                 f"{expected} of at most {LARGEST_YAML} bytes, found {size}; give another file"
             )
         text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{expected}, found no such file; check the path") from None
     except OSError as error:
         raise InputError(f"{expected}, found {error.strerror}; check the path") from None
     except UnicodeDecodeError:

@@ -49,6 +49,7 @@ MAKER_PREFIXES = {
 }
 MAX_LASERS = 256  # largest number of lasers that are simulated
 USUAL_SHOTS = 1800  # number of shots of a laser in a rotation, if nothing says otherwise
+KEYS_OF_DATA = ("classes", "scans", "root")  # tell a description of data from one of a sensor
 MAX_NUMBER = 1e9  # largest number in the description of a sensor
 
 
@@ -273,6 +274,11 @@ def _read_sensor(text: str) -> Sensor:
     if not isinstance(tree, Mapping):
         raise InputError(
             f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md"
+        )
+    if of_data := [key for key in KEYS_OF_DATA if key in tree]:
+        raise InputError(
+            f"{path}: expected a description of a sensor, found one of data "
+            f"({', '.join(of_data)}); give it as DATA or INPUT"
         )
     with errors_of(path):
         described = make_sensor(tree)

@@ -253,7 +253,9 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
     if not recipe.from_init:
         return recipe
     if init is None:
-        raise InputError("expected weights to begin with for this recipe, found none; add --init")
+        raise InputError(
+            "expected weights to begin with for this recipe, found none; add --init sim-any"
+        )
 
     return dataclasses.replace(recipe, model=init.model, sensor=init.sensor)
 
