@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("docs")
     points, _ = place(LASERS["vlp16"], 0.9)
     points.tofile(folder / "scan.bin")
-    for name in ("more_scans", "robot"):
+    for name in ("more_scans", "scans"):
         (folder / name).mkdir()
         points.tofile(folder / name / "000000.bin")
         points.tofile(folder / name / "000001.bin")
@@ -46,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows.astype(np.float32).tofile(folder / "rows.bin")
     write_pcd(folder / "cloud.pcd", points * np.array([1, 1, 1, 255], np.float32), "binary")
     write_bag1(folder / "drive.bag", {"/lidar/top": [points], "/lidar/side": [points]})
-    (folder / "robot.yaml").write_text(SENSOR.blocks("yaml")[0])
+    (folder / "sensor.yaml").write_text(SENSOR.blocks("yaml")[0])
     expects = load("sim-hdl64e").expects
     save(replace(fresh_weights(), expects=expects, sensor="hdl64e"), folder / "tiny.safetensors")
     return folder

@@ -495,7 +495,7 @@ def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
         ("offset: here", ["offset"]),
         ("axes: up", ["axes", "x-forward"]),
         ("- 1", ["keys"]),
-        ("classes: {car: 1}\nscans: '*.pcd'", ["one of data (classes, scans); give it as DATA or INPUT"]),
+        ("classes: {car: 1}\nscans: '*.pcd'", ["(classes, scans); give it as DATA or INPUT"]),
         ("a: [", ["YAML"]),
         ("[" * 5000, ["YAML"]),
     ],
