@@ -1,4 +1,4 @@
-"""The pages use commands and options that exist, and the README names all extras."""
+"""The pages use commands and options that exist, and name all extras."""
 
 from __future__ import annotations
 
@@ -39,11 +39,21 @@ def test_every_command_can_be_parsed(page: str) -> None:
         parser_of(command).values(arguments)
 
 
-def test_the_readme_names_every_extra() -> None:
+@pytest.mark.parametrize("page", ["README.md", "docs/installation.md"])
+def test_the_readme_and_the_page_on_the_installation_name_every_extra(page: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    readme = (ROOT / "README.md").read_text()
+    text = (ROOT / page).read_text()
     for extra in project["optional-dependencies"]:
-        assert f"`{extra}`" in readme
+        assert f"`{extra}`" in text
+
+
+def test_the_page_on_the_installation_has_the_extras_of_the_makefile_and_its_lines() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    page = DocsPage("docs/installation.md").text
+    (extras,) = re.findall(r"(?m)^EXTRAS \?= (.*)", makefile)
+    assert re.findall(r"(?m)^\| `(\w+)` \| .* \| yes \|$", page) == extras.split(",")
+    for line in re.findall(r'@echo "(installing (?:PyTorch|amvnet) .*)"', makefile):
+        assert f"    {line}\n" in page
 
 
 def test_the_first_screen_of_the_readme_needs_no_word_of_the_method() -> None:
