@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,13 @@ import pytest
 import yaml
 
 from amvnet.data.class_maps import BUILT_IN, class_map
+from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.weights.file import save
 
+from fixtures.browser_pages import read_page
 from fixtures.commands import fails, refusal, refused, succeed
+from fixtures.own_scans import make_own_scans, make_robot_quick
 from fixtures.tiny import GOLDEN, fresh_weights, make_streets
 
 EQUAL = {  # classes of SemanticKITTI and of nuScenes that each built-in map takes for the same
@@ -92,7 +96,67 @@ def test_a_misspelt_class_in_a_map_is_refused_by_every_command(tmp_path: Path) -
 def test_a_map_may_name_classes_of_the_data_and_of_other_benchmarks(tmp_path: Path) -> None:
     path = write_map(tmp_path / "few.yaml", {"animal": ["cat"], "ground": ["driveable_surface"]})
     assert class_map(str(path), fake_taxonomy()).table(fake_taxonomy()).tolist() == [0, 1]
-    fails(lambda: class_map(str(path)), path, "animal", "'cat'")
+    fails(lambda: class_map(str(path), SEMANTICKITTI), path, "animal", "'cat'")
+
+
+@pytest.mark.parametrize("kind", ["label", "npy", "csv", "ply", "pcd"])
+def test_the_printed_command_shows_the_labels_of_a_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    data = make_streets(tmp_path / "data")
+    few = write_map(tmp_path / "few.yaml", {"car": {"id": 9}, "ground": ["road", "parking"]})
+    out, page = tmp_path / "out", tmp_path / "page.html"
+    options = ("--weights", weights, "--classes", few, "--out", out, "--format", kind)
+    succeed("predict", data / "sequences/08/velodyne", *options)
+    command = capsys.readouterr().out.partition("look at them: amvnet ")[2].splitlines()[0]
+    succeed(*shlex.split(command), "--html", page)
+
+    shown = read_page(page)
+    assert shown.about["classes"] == ["unlabelled", "car", "ground"]
+    written = read_raw_labels(out / f"000000.{kind}", shown.about["scans"][0]["count"], missing=0)
+    ids = np.array([0, 9, 2])[shown.scan(0)[1]["labels"]]
+    np.testing.assert_array_equal(ids, written)
+    assert command.startswith(f"view {out}/000000.{kind}") == (kind in ("ply", "pcd"))
+
+
+def test_labels_of_other_classes_than_those_that_are_shown_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_robot_quick(monkeypatch)
+    data = make_own_scans(tmp_path / "robot")
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    few = write_map(tmp_path / "few.yaml", {"ground": ["road", "sidewalk"], "rest": ["car"]})
+    for out, options in (("fine", ()), ("few", ("--classes", few))):
+        succeed("predict", data, "--weights", weights, "--out", tmp_path / out, *options)
+
+    view = ("view", data, "--html", tmp_path / "page.html", "--labels")
+    refused((*view, tmp_path / "few"), tmp_path / "few", "give the --classes of predict")
+    refused((*view, tmp_path / "few", "--classes", "coarse"), "classes of coarse", "a map made")
+    refused((*view, tmp_path / "fine", "--classes", few), "leave out --classes")
+    succeed(*view, tmp_path / "few", "--classes", few)
+    page = read_page(tmp_path / "page.html")
+    assert page.about["classes"] == ["unlabelled", "ground", "rest"]
+    _, planes = page.scan(0)
+    truth = np.load(tmp_path / "robot/site_a/truth/0000.npy")
+    np.testing.assert_array_equal(planes["truth"], truth == 3)
+
+
+def test_the_labels_of_weights_and_the_truth_are_shown_with_the_classes_of_a_map(
+    tmp_path: Path,
+) -> None:
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    data = make_streets(tmp_path / "data")
+    pages = []
+    for name, options in (("fine", ()), ("coarse", ("--classes", "coarse"))):
+        path = tmp_path / f"{name}.html"
+        succeed("view", data, "--weights", weights, "--html", path, *options)
+        pages.append(read_page(path))
+    table = class_map("coarse").table(SEMANTICKITTI)
+    (_, fine), (_, coarse) = (page.scan(0) for page in pages)
+    for plane in ("truth", "rv", "bev", "ensemble", "amvnet"):
+        np.testing.assert_array_equal(coarse[plane], table[fine[plane]])
+    assert not any(plane.endswith("probability") for plane in coarse)
 
 
 @pytest.mark.parametrize(

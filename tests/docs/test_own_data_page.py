@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from amvnet.weights.file import load, save
-from lidarstreets import LIDAR_MODELS, SimulatedScan
+from lidarstreets import LIDAR_MODELS
 
-from fixtures import own_scans
 from fixtures.commands import succeed
-from fixtures.own_scans import CLASSES, make_own_scans
+from fixtures.own_scans import CLASSES, make_own_scans, make_robot_quick
 from fixtures.pages import Changes, DocsPage, run
-from fixtures.tiny import fake_drive, fresh_weights, simulate_in_this_process, write_recipe
+from fixtures.tiny import fresh_weights, simulate_in_this_process, write_recipe
 
 PAGE = DocsPage("docs/own_data.md")
 ONE_EPOCH = {"rv": {"epochs": 1}, "bev": {"epochs": 1}, "head": {"epochs": 1}}
@@ -68,10 +66,7 @@ def test_every_command_of_the_page_runs(
 
 
 def test_scores_are_of_the_users_classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def quick_scans(street: int) -> Iterator[SimulatedScan]:
-        return fake_drive("vlp16", own_scans.SCANS, np.random.SeedSequence(street))
-
-    monkeypatch.setattr(own_scans, "robot_scans", quick_scans)
+    make_robot_quick(monkeypatch)
     data = make_own_scans(tmp_path)
     truth = np.load(tmp_path / "site_c/truth/0000.npy")
     for path in sorted((tmp_path / "site_c/truth").glob("*.npy")):

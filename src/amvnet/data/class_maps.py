@@ -33,27 +33,30 @@ class ClassMap:
         same_name = self.target.classes.index(name) + 1 if name in self.target.classes else 0
         return self.sources.get(name, same_name)
 
+    def names_any(self, taxonomy: Taxonomy) -> bool:
+        """Return whether a class of a taxonomy becomes one of `target`."""
+        return any(map(self.train_id, taxonomy.classes))
+
     def table(self, taxonomy: Taxonomy) -> np.ndarray:
         """Return the train ids in `target`, (K + 1,) uint8, indexed by a taxonomy's train ids.
 
         Raises:
             InputError: if the map names none of the classes.
         """
-        train_ids = [0, *map(self.train_id, taxonomy.classes)]
-        if not any(train_ids):
+        if not self.names_any(taxonomy):
             raise InputError(
                 f"--classes {self.target.name}: expected a map of the classes of {taxonomy.name} "
                 f"({', '.join(taxonomy.classes)[:200]}), found none of them; write a YAML file"
             )
 
-        return np.array(train_ids, dtype=np.uint8)
+        return np.array([0, *map(self.train_id, taxonomy.classes)], dtype=np.uint8)
 
 
 def class_map(name: str, *taxonomies: Taxonomy) -> ClassMap:
     """Return a built-in map or the map in a YAML file.
 
     Args:
-        taxonomies: the classes of the weights and of the data.
+        taxonomies: the classes of the weights and of the data; without any, names are not checked.
 
     Raises:
         InputError: if there is no such map, or it names a class that neither these nor a benchmark
@@ -72,7 +75,8 @@ def class_map(name: str, *taxonomies: Taxonomy) -> ClassMap:
 
     with errors_of(path):
         mapping = _parse(path.stem, read_yaml(path, "a map of classes"))
-        _check_names(mapping, (*taxonomies, *TAXONOMIES.values()))
+        if taxonomies:
+            _check_names(mapping, (*taxonomies, *TAXONOMIES.values()))
         return mapping
 
 

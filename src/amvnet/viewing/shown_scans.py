@@ -10,8 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from amvnet.data.class_maps import ClassMap
 from amvnet.data.recordings import ScanFile
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.inference.journal import read_journals
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import (
     Origin,
@@ -70,8 +73,13 @@ class ShownScan:
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
-def check_labels(labels: Path, count: int) -> None:
-    """Raise InputError if no labels exist there, or if a label file stands for several scans."""
+def check_labels(labels: Path, count: int, classes: ClassMap | None = None) -> None:
+    """Check that labels are there, for `count` scans, with the classes of a map if there is one.
+
+    Raises:
+        InputError: if no labels exist there, a label file stands for several scans, or the journal
+            of `predict` says that it wrote other classes.
+    """
     if not labels.exists():
         raise InputError(
             f"{labels}: expected a file or a folder of labels, found none; check the path"
@@ -80,6 +88,16 @@ def check_labels(labels: Path, count: int) -> None:
         raise InputError(
             f"{labels}: expected a folder of labels for {count} scans, found a file; give a folder"
         )
+    mapped = None if classes is None else repr(classes)
+    for settings in read_journals(labels if labels.is_dir() else labels.parent).settings:
+        written = settings.get("classes")
+        if written != mapped:
+            found = "classes that a map made" if written else "classes that no map made"
+            advice = "give the --classes of predict" if written else "leave out --classes"
+            expected = f"of {classes.target.name}" if classes is not None else "of the inputs"
+            raise InputError(
+                f"{labels}: expected labels with the classes {expected}, found {found}; {advice}"
+            )
 
 
 def show_scans(
@@ -87,6 +105,7 @@ def show_scans(
     segmenter: Segmenter | None = None,
     labels: Path | None = None,
     progress: Progress = no_progress,
+    classes: ClassMap | None = None,
 ) -> Iterator[ShownScan]:
     """Yield scans for viewing, in order; each is read and labelled when it is needed.
 
@@ -94,6 +113,8 @@ def show_scans(
         segmenter: labels the scans; the labels of its networks are shown with its own.
         labels: without a segmenter, a folder of predictions as `predict` writes them, or the label
             file of a single scan; by default, the labels that files of `predict` and `map` hold.
+        classes: maps the classes of the truth and of the segmenter to those that are shown, which
+            `labels` already have.
 
     Raises:
         InputError: if a file is broken or missing.
@@ -108,7 +129,8 @@ def show_scans(
             result = segmenter(scan)
             assert result.origin is not None
             shown = shown_scan(result, result.origin)
-            return replace(shown, name=scan_input.title, corrected=scan_input.corrected)
+            shown = replace(shown, name=scan_input.title, corrected=scan_input.corrected)
+            return _mapped(shown, scan_input, classes, segmenter.taxonomy)
 
         shown = ShownScan(
             scan_input.title,
@@ -118,16 +140,51 @@ def show_scans(
             corrected=scan_input.corrected,
         )
         if labels is not None:
-            ids = scan_input.dataset.read_prediction(scan_input, labels, len(scan))
+            target = None if classes is None else classes.target
+            ids = scan_input.dataset.read_prediction(scan_input, labels, len(scan), target)
         elif (stored := scan_input.dataset.stored_labels(scan_input, len(scan))) is not None:
             ids = stored
             shown = _near_the_middle(shown)
         else:
-            return shown
-        return replace(shown, labels={"labels": ids})
+            return _mapped(shown, scan_input, classes)
+        shown = replace(shown, labels={"labels": ids})
+        of_labels = None if labels is not None else scan_input.dataset.taxonomy
+        return _mapped(shown, scan_input, classes, of_labels)
 
     at_once = 1 if segmenter is None else segmenter.at_once
     return stream_scans(scans, load, show, at_once, progress)
+
+
+def _mapped(
+    shown: ShownScan,
+    scan_input: ScanFile,
+    classes: ClassMap | None,
+    of_labels: Taxonomy | None = None,
+) -> ShownScan:
+    """Return a scan with the classes of a map: its truth, and its labels if these have others.
+
+    The networks give no probabilities of these classes, and no file holds corrected labels.
+    """
+    if classes is None:
+        return shown
+    truth = shown.truth
+    if truth is not None and shown.labels and not classes.names_any(scan_input.dataset.taxonomy):
+        truth = None  # the labels can be seen without it
+    elif truth is not None:
+        truth = classes.table(scan_input.dataset.taxonomy)[truth]
+    labels = shown.labels
+    if of_labels is not None:
+        table = classes.table(of_labels)
+        labels = {method: table[ids] for method, ids in labels.items()}
+    return replace(
+        shown,
+        truth=truth,
+        labels=labels,
+        probabilities={},
+        second=None,
+        second_probability=None,
+        corrected="",
+    )
 
 
 def _near_the_middle(shown: ShownScan) -> ShownScan:

@@ -24,6 +24,7 @@ from amvnet.sensors.lidars import AUTO
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
+    from amvnet.inference.journal import Entry
     from amvnet.inference.segmenter import Segmenter
 
 
@@ -103,23 +104,42 @@ def predict(
     report(f"{counted(len(entries), 'label file')} in {out}")
     if is_new:  # else the user has seen these lines
         options = [*given_options(choice), *given_options(sensor_choice)]
-        _report_next(inputs, weights, out, request.taxonomy, options)
+        look = _words_to_look(inputs, options, weights, out, labels, request.taxonomy, entries)
+        report(f"look at them: {shlex.join(['amvnet', 'view', *look])}")
+        _report_training(inputs, weights)
 
 
-def _report_next(
-    inputs: list[str], weights: str, out: str, written: Taxonomy, options: list[str]
-) -> None:
-    """Report the commands that show the labels of `written` classes, and that train further."""
+def _words_to_look(
+    inputs: list[str],
+    options: list[str],
+    weights: str,
+    out: str,
+    labels: LabelChoice,
+    written: Taxonomy,
+    entries: list[Entry],
+) -> list[str]:
+    """Return the arguments of `view` that show the labels of `written` classes."""
     from amvnet.data.datasets.open import is_dataset
+    from amvnet.data.formats.registry import COMMENT_READERS
     from amvnet.data.taxonomy import TAXONOMIES
 
-    labels = ["--weights", weights]  # `view` knows no other classes of label files
+    if f".{labels.format}" in COMMENT_READERS and entries and not any(map(is_dataset, inputs)):
+        name = entries[0].scan.removesuffix(".npz")
+        return [str(Path(out) / f"{name}.{labels.format}")]  # it names its classes
+    if labels.classes is not None:
+        return [*inputs, *options, "--labels", out, "--classes", labels.classes]
     if TAXONOMIES.get(written.name) == written:
-        labels = ["--labels", out, "--taxonomy", written.name]
+        return [*inputs, *options, "--labels", out, "--taxonomy", written.name]
+    return [*inputs, *options, "--weights", weights]  # `view` knows no other classes of label files
+
+
+def _report_training(inputs: list[str], weights: str) -> None:
+    """Report the command that trains further."""
+    from amvnet.data.datasets.open import is_dataset
+
     datasets = [text for text in inputs if is_dataset(text)]
     data = datasets[0] if datasets else "YOURS.yaml"
     source = "" if datasets else " that YOURS.yaml describes (docs/own_data.md)"
 
-    report(f"look at them: {shlex.join(['amvnet', 'view', *inputs, *options, *labels])}")
     command = ["amvnet", "train", "finetune", "--init", weights, "--data", data]
     report(f"train on your labels{source}: {shlex.join([*command, '--out', 'runs/finetuned'])}")

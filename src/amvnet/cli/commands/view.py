@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, report
-from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter, open_inputs
+from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter, map_to, open_inputs
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError
@@ -25,6 +25,7 @@ def view(
     html: Path | None = None,
     scans: Count = 5,
     taxonomy: Literal["semantickitti", "nuscenes"] | None = None,
+    classes: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Look at scans, labels, uncertain points and errors in 3D, in a browser.
@@ -42,6 +43,8 @@ def view(
             page, which opens in the browser.
         scans: largest number of scans; they are evenly spaced in the inputs.
         taxonomy: the classes of labels that belong to no dataset.
+        classes: the classes to show: coarse, lidog, or a YAML file, as predict took it to write the
+            labels. It maps the classes of the data and of the weights to them.
         overwrite: replace the page if it exists.
     """
     from amvnet.data.recordings import evenly_spaced
@@ -60,27 +63,41 @@ def view(
             "expected no --taxonomy together with --weights, which define their classes; "
             "leave it out"
         )
+    if taxonomy is not None and classes is not None:
+        raise InputError("expected --taxonomy or --classes, found both; give one of them")
     # Check the page's place before any scan is segmented, so that no time is wasted.
     if html is not None:
         html = page_name(html)
-        check_outputs({html: PAGE}, [*inputs, labels, weights, sensor_choice.sensor], overwrite)
+        also_read = [*inputs, labels, weights, classes, sensor_choice.sensor]
+        check_outputs({html: PAGE}, also_read, overwrite)
         make_folder(html.parent)
 
-    classes = None if taxonomy is None else TAXONOMIES[taxonomy]
+    named = None if taxonomy is None else TAXONOMIES[taxonomy]
     segmenter = None
     if weights is None:
         found = find_inputs(inputs, choice.parse(sensor_choice))
-        found_scans, classes = found.scans(classes, Normaliser(None, found.reading.sensor, report))
+        found_scans, shown_classes = found.scans(
+            named, Normaliser(None, found.reading.sensor, report)
+        )
+        mapping = map_to(classes)
     else:
         found, weights, loaded = open_inputs(inputs, choice, sensor_choice, weights)
-        found_scans, classes = found.for_weights(loaded, report), loaded.taxonomy
+        mapping = map_to(classes, loaded.taxonomy, *found.taxonomies)
+        shown_classes = loaded.taxonomy
+        if mapping is None:
+            found_scans = found.for_weights(loaded, report)
+        else:  # the data may have other classes than the weights
+            normaliser = Normaliser(loaded.expects, found.reading.sensor, report)
+            found_scans, _ = found.scans(normaliser=normaliser)
         segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
     if labels is not None:
-        check_labels(labels, len(found_scans))
+        check_labels(labels, len(found_scans), mapping)
+    if mapping is not None:
+        shown_classes = mapping.target
     chosen = evenly_spaced(found_scans, scans)
     with place_for_page(html) as page, progress("looking") as step:
-        shown = show_scans(chosen, segmenter, labels, progress=step)
-        write_page(page, shown, classes, _title(inputs, weights))
+        shown = show_scans(chosen, segmenter, labels, step, mapping)
+        write_page(page, shown, shown_classes, _title(inputs, weights))
     report(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")
     if html is None:
         open_page(page)

@@ -276,19 +276,26 @@ class Dataset(ABC):
         return None
 
     def read_prediction(
-        self, record: ScanFile, folder: Path, count: int | None = None
+        self,
+        record: ScanFile,
+        folder: Path,
+        count: int | None = None,
+        taxonomy: Taxonomy | None = None,
     ) -> np.ndarray:
         """Read the (N,) uint8 train ids (0..K) that were predicted for a scan.
 
         Args:
             count: N, if it is known; else it is read from the scan's file.
+            taxonomy: the classes of the prediction; by default the classes of the dataset.
 
         Raises:
             InputError: if the file is missing, has another number of points or an unknown id.
         """
         path = Path(folder) / record.prediction
         raw = read_ids(path, _id_type(path), count or self.count_points(record))
-        return train_ids(path, raw, self.taxonomy, "write the predictions with these ids")
+        return train_ids(
+            path, raw, taxonomy or self.taxonomy, "write the predictions with these ids"
+        )
 
     def write_prediction(
         self,

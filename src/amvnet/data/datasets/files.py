@@ -93,13 +93,18 @@ class ScanFiles(Dataset):
         return read_scan_labels(record.path, count, self.taxonomy)
 
     def read_prediction(
-        self, record: ScanFile, folder: Path, count: int | None = None
+        self,
+        record: ScanFile,
+        folder: Path,
+        count: int | None = None,
+        taxonomy: Taxonomy | None = None,
     ) -> np.ndarray:
         """Read labels from a folder of predictions, or from the label file of the only scan."""
         if folder.is_dir():
             paths = [folder / self.place_of_prediction(record, kind) for kind in KINDS]
             folder = next(filter(Path.is_file, paths), paths[0])
-        return read_scan_labels(folder, count or self.count_points(record), self.taxonomy)
+        count = count or self.count_points(record)
+        return read_scan_labels(folder, count, taxonomy or self.taxonomy)
 
     def write_labels(
         self,
