@@ -233,6 +233,28 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
     assert iou["building"] == pytest.approx(matrix[2] / (matrix[2] + matrix[3]))
 
 
+def test_classes_that_are_not_scored_are_said_with_their_share(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_robot_quick(monkeypatch)
+    data = make_own_scans(tmp_path / "robot")
+    truths = []
+    for path in (tmp_path / "robot/site_c/truth").glob("*.npy"):
+        truths.append(np.load(path))
+        truths[-1][:9] = 7
+        np.save(path, truths[-1])
+    truth = np.concatenate(truths)
+    lost = np.isin(truth, (7, 21)).sum() / (truth != -1).sum()
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    succeed("evaluate", data, "--weights", weights, "--classes", "coarse")
+    printed = capsys.readouterr().out
+    assert f"not scored: plant, structure ({lost:.0%} of the labelled points)" in printed
+    assert "which coarse does not name" in printed
+    streets = make_streets(tmp_path / "data")
+    succeed("evaluate", streets, "--weights", weights, "--classes", "coarse")
+    assert "not scored" not in capsys.readouterr().out
+
+
 def test_two_classes_of_one_name_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "few.yaml"
     path.write_text("classes: {ground: [road], 'ground': [car]}")

@@ -28,7 +28,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS, PAPER_METHODS
 from amvnet.models.voting import vote
 from amvnet.outputs import Signature
-from amvnet.progress import Progress, no_progress
+from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan, check_scan
 
@@ -87,6 +87,7 @@ def evaluate(
     progress: Progress = no_progress,
     processes: Processes = ALONE,
     drives: Drives | None = None,
+    report: Reporter = report_nothing,
 ) -> Evaluation:
     """Score the labels of some scans.
 
@@ -95,6 +96,7 @@ def evaluate(
         processes: the processes that share the scans. Each returns the evaluation of all scans.
         drives: the poses of the scans, if the method `DRIVE` is to be scored as well. The networks
             then get each scan twice: as it is, and turned.
+        report: gets a line if points have a class that is not scored.
 
     Raises:
         InputError: if the labels do not have the dataset's classes, or a scan has no true labels.
@@ -105,6 +107,7 @@ def evaluate(
     true_table = labeller.table(dataset.taxonomy)
     table = labeller.table(labeller.taxonomy)
     evaluation = Evaluation(taxonomy)
+    counts = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)  # true points by class
     pictured = {record.name for record in evenly_spaced(records, MAX_PICTURES)}
 
     def label(record: ScanFile, scan: Scan) -> tuple[ScanFile, Scan, MethodLabels]:
@@ -124,6 +127,7 @@ def evaluate(
     for record, scan, labels in labelled:
         assert scan.labels is not None
         truth = true_table[scan.labels]
+        counts += np.bincount(scan.labels, minlength=len(counts))
         ids = {name: table[values] for name, values in labels.ids.items()}
 
         uncertain = labels.uncertain
@@ -134,6 +138,13 @@ def evaluate(
             )
             draw_scan(_picture_of(record, pictures), view)
 
+    total = sum(processes.gather(counts), np.zeros_like(counts))
+    total[0] = 0
+    lost = total * (true_table == 0)
+    if lost.any():
+        names = ", ".join(dataset.taxonomy.names[index] for index in np.flatnonzero(lost))
+        part = f"{lost.sum() / total.sum():.0%} of the labelled points"
+        report(f"not scored: {names} ({part}), which {taxonomy.name} does not name")
     return sum(processes.gather(evaluation), Evaluation(taxonomy))
 
 

@@ -116,7 +116,7 @@ def evaluate(
     processes.wait()
     with progress("scoring") as step:
         evaluation = evaluate_records(
-            dataset, records, labeller, pictures, progress=step, processes=processes, drives=drives
+            dataset, records, labeller, pictures, step, processes, drives, report
         )
     if processes.first:
         show_evaluation(evaluation, data, json, tau)
