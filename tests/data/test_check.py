@@ -16,7 +16,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.plausible import following, neighbours
 
-from fixtures.commands import refusal, refused, run_cli
+from fixtures.commands import refusal, refused, run_cli, succeed
 from fixtures.datasets import MAKERS
 from fixtures.examples import first_of
 from fixtures.scan_writers import some_points
@@ -271,6 +271,21 @@ def test_clouds_that_are_sorted_without_their_labels_are_reported(
     text = "\n".join(warnings_of(data, lambda points, raw: (points[order(points)], raw)))
     assert "train: labels do not follow the geometry in 4 of 4 scans, such as a/0;" in text
     assert "val: labels do not follow the geometry in 2 of 2 scans, such as c/0;" in text
+
+
+def test_scans_with_labels_in_another_order_are_warned_of_and_not_counted(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    warnings_of(data, lambda points, raw: (points, raw))
+    succeed("check", data)
+    before = capsys.readouterr().out
+    assert "scans can be trained on or scored" in before
+    assert "warning:" not in before
+    warnings_of(data, lambda points, raw: (points[np.argsort(points[:, 0])], raw))
+    succeed("check", data)
+    after = capsys.readouterr().out
+    assert "\nwarning: train: labels do not follow the geometry in 4 of 4 scans" in after
+    assert "can be trained on" not in after
 
 
 def test_ground_high_above_other_points_is_reported(data: Path) -> None:

@@ -129,7 +129,9 @@ def test_the_file_of_read_only_data_comes_into_the_current_folder(
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != folder.parent)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    refused(f"check {folder}", f"{tmp_path}/here/data.yaml is now the beginning")
+    refused(
+        f"check {folder}", f"amvnet: wrote {tmp_path}/here/data.yaml: name its classes, then run"
+    )
     assert not Path(f"{folder}.yaml").exists()
     succeed("check data.yaml")
     before = Path("data.yaml").read_bytes()

@@ -200,6 +200,11 @@ class Report:
                 "correct them or leave them out (amvnet check lists all)"
             )
 
+    def doubts(self) -> Iterator[str]:
+        """Yield those of the `warnings` that say that labels are hardly right."""
+        for name, split in self.splits.items():
+            yield from (f"{name}: {line}" for line in self._implausible(split))
+
     def warnings(self) -> Iterator[str]:
         """Yield a line for each thing that may be a mistake."""
         for name, split in self.splits.items():

@@ -41,8 +41,7 @@ def check(data: str, /, choice: TrainingChoice) -> None:
         for line in found.lines():
             report(line)
         raise InputError(
-            f"{data}: expected a dataset, found scans that no YAML file describes; {path} is now "
-            f"the beginning of one: name its classes, and run amvnet check {shlex.quote(str(path))}"
+            f"wrote {path}: name its classes, then run amvnet check {shlex.quote(str(path))}"
         )
     dataset = open_dataset(data)
     scans = [scan.read for recording in dataset.recordings() for scan in recording.scans]
@@ -62,7 +61,8 @@ def check(data: str, /, choice: TrainingChoice) -> None:
             _check(dataset, {"all": records})
         raise
     usable = _check(dataset, splits)
-    report(f"{counted(usable, 'scan')} can be trained on or scored")
+    if usable:
+        report(f"{counted(usable, 'scan')} can be trained on or scored")
 
 
 def _report_sensors(dataset: Dataset) -> None:
@@ -80,7 +80,7 @@ def _report_sensors(dataset: Dataset) -> None:
 
 
 def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanFile]]) -> int:
-    """Print what is in the labels of some scans, and return the number of scans.
+    """Print what is in the labels of some scans, and return the number of scans that can be used.
 
     If something must be corrected, raise InputError; if only some scans are broken, SomeBroken.
     """
@@ -93,8 +93,9 @@ def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanFile]]) -> int:
     show(contents_table(checked))
     if checked.unknown:
         show(unknown_table(checked))
+    doubts = list(checked.doubts())
     for line in checked.warnings():
-        report(line)
+        report(f"warning: {line}" if line in doubts else line)
 
     broken = checked.broken
     error = next(checked.errors(), None)
@@ -110,4 +111,4 @@ def _check(dataset: Dataset, splits: Mapping[str, Sequence[ScanFile]]) -> int:
             "out",
             list(broken.values()),
         )
-    return sum(len(split.scans) for split in checked.splits.values())
+    return sum(len(split.scans) - len(split.stray) for split in checked.splits.values())
