@@ -14,6 +14,15 @@ ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 
 
+def run_make(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run make as a user does, though `make test` may run this: make inside make says more."""
+    alone = {name: value for name, value in os.environ.items() if "MAKE" not in name}
+    command = ["make", *words]
+    return subprocess.run(
+        command, cwd=folder, env=alone, capture_output=True, text=True, check=False
+    )
+
+
 @pytest.mark.parametrize("target", ["install", "demo"])
 def test_a_target_ends_with_the_line_that_activates_the_environment(
     target: str, tmp_path: Path
@@ -28,9 +37,9 @@ def test_a_target_ends_with_the_line_that_activates_the_environment(
     (tmp_path / ".venv/installed").touch()
     os.utime(tmp_path / ".venv/installed", (2**33, 2**33))  # newer than what it is made of
 
-    # `make test` runs this, and a make inside another one says which folder it enters and leaves.
-    make = ["make", "--no-print-directory", target]
-    lines = subprocess.check_output(make, cwd=tmp_path, text=True).splitlines()
+    done = run_make(tmp_path, target)
+    assert done.returncode == 0
+    lines = done.stdout.splitlines()
     assert lines[-2].split("#")[0].strip() == "source .venv/bin/activate"
     assert lines[-1].split("#")[0].strip() == "amvnet predict scan.bin"
 
@@ -51,8 +60,7 @@ def test_an_old_or_missing_python_is_refused_before_anything_is_installed(
         )
         python.chmod(0o755)
 
-    make = ["make", "--no-print-directory", "install", f"PYTHON={python}"]
-    done = subprocess.run(make, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = run_make(tmp_path, "install", f"PYTHON={python}")
     assert done.returncode != 0
     assert done.stdout == ""
     found = version or f"no {python}"
