@@ -359,9 +359,7 @@ def test_every_file_has_the_mode_of_the_umask(umask: int, tmp_path: Path) -> Non
     assert {stat.S_IMODE(path.stat().st_mode) for path in paths} == {0o666 & ~umask}
 
 
-def test_the_content_is_on_the_disk_before_the_name(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_content_is_on_disk_before_a_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls: list[tuple[str, Any]] = []
 
     def record(name: str) -> Callable[..., None]:

@@ -134,9 +134,7 @@ def test_a_users_file_stays_and_nothing_is_written(
 
 
 @pytest.mark.parametrize("name", with_full(CASES, SLOW + ALIKE))
-def test_an_earlier_file_of_the_same_kind_is_replaced_if_the_user_says_so(
-    name: str, world: Path, tmp_path: Path
-) -> None:
+def test_files_of_one_kind_are_replaced_if_told(name: str, world: Path, tmp_path: Path) -> None:
     case = CASES[name]
     earlier = tmp_path / case.file
     earlier.parent.mkdir(parents=True, exist_ok=True)
@@ -208,9 +206,7 @@ def test_no_output_is_an_input(name: str, is_hard: bool, world: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("labels", [".label", "../truth/{name}.label"])
-def test_the_users_labels_are_not_replaced_by_those_of_other_classes(
-    labels: str, world: Path, tmp_path: Path
-) -> None:
+def test_labels_are_not_replaced_by_other_classes(labels: str, world: Path, tmp_path: Path) -> None:
     """Labels of other classes are not read. They are inputs all the same."""
     scan = tmp_path / "scans/a.bin"
     scan.parent.mkdir()
@@ -229,9 +225,7 @@ def test_the_users_labels_are_not_replaced_by_those_of_other_classes(
     assert contents(tmp_path) == before
 
 
-def test_a_labelled_scan_is_not_replaced_by_labels_from_another_folder(
-    world: Path, tmp_path: Path
-) -> None:
+def test_labels_of_another_folder_replace_no_labelled_scan(world: Path, tmp_path: Path) -> None:
     """Points that predict has labelled are a scan, too."""
     succeed(f"{SCANS} --format ply".format(world=world, out=tmp_path / "scans"))
     (tmp_path / "out").symlink_to(tmp_path / "scans")
@@ -260,9 +254,7 @@ def test_a_device_is_not_replaced(world: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["recipe.yaml", "weights.safetensors", "rv/last.ckpt", "head/a"])
-def test_a_run_takes_no_folder_with_files_of_its_names(
-    name: str, world: Path, tmp_path: Path
-) -> None:
+def test_a_run_takes_no_folder_with_files_so_named(name: str, world: Path, tmp_path: Path) -> None:
     mine = tmp_path / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_bytes(MINE if "weights" not in name else (world / "w.safetensors").read_bytes())
@@ -272,9 +264,7 @@ def test_a_run_takes_no_folder_with_files_of_its_names(
     assert contents(tmp_path) == before
 
 
-def test_the_table_of_an_ablation_is_replaced_only_among_its_runs(
-    world: Path, tmp_path: Path
-) -> None:
+def test_an_ablations_table_is_replaced_only_among_its_runs(world: Path, tmp_path: Path) -> None:
     (tmp_path / "ablation.csv").write_bytes(MINE)
     refused(f"ablate semantickitti-compact --data {world}/data --out {tmp_path}", "ablation.csv")
     assert contents(tmp_path) == {"ablation.csv": MINE}
@@ -284,9 +274,7 @@ def test_the_table_of_an_ablation_is_replaced_only_among_its_runs(
     ("sensor", "name"),
     [("hdl64e", "sequences/01/velodyne/000000.bin"), ("hdl32e", "v1.0-trainval/scene.json")],
 )
-def test_real_scans_are_not_replaced_by_simulated_ones(
-    sensor: str, name: str, tmp_path: Path
-) -> None:
+def test_simulated_scans_do_not_replace_real_ones(sensor: str, name: str, tmp_path: Path) -> None:
     mine = tmp_path / name
     mine.parent.mkdir(parents=True)
     mine.write_bytes(MINE)

@@ -163,9 +163,7 @@ def test_names_colours_and_raw_ids_are_aligned_with_ids(result: Segmentation) ->
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_result_is_saved_in_the_format_of_the_ending(
-    kind: str, result: Segmentation, tmp_path: Path
-) -> None:
+def test_the_ending_decides_the_format(kind: str, result: Segmentation, tmp_path: Path) -> None:
     path = result.save(tmp_path / f"new/a.b.{kind}")
     assert files(tmp_path) == {f"new/a.b.{kind}"}
     if kind == "label":
@@ -214,9 +212,7 @@ def test_a_scan_is_never_replaced_by_its_labels(tmp_path: Path, segmenter: Segme
     assert (tmp_path / "link.ply").is_symlink()
 
 
-def test_labels_replace_earlier_labels_and_nothing_else(
-    result: Segmentation, tmp_path: Path
-) -> None:
+def test_labels_replace_earlier_labels_alone(result: Segmentation, tmp_path: Path) -> None:
     for kind in KINDS:
         path = result.save(tmp_path / f"a.{kind}")
         before = path.read_bytes()

@@ -181,9 +181,7 @@ QUICK_MISTAKES = (
 
 
 @pytest.mark.parametrize("mistake", with_quick(MISTAKES, QUICK_MISTAKES))
-def test_a_mistake_is_one_line_and_leaves_nothing(
-    mistake: str, world: Path, wrong: Path, tmp_path: Path
-) -> None:
+def test_a_mistake_leaves_one_line(mistake: str, world: Path, wrong: Path, tmp_path: Path) -> None:
     before = files(world)
     line = refusal(MISTAKES[mistake].format(w=world, wrong=wrong, out=tmp_path / "out"))
     assert line.startswith("amvnet: ")
@@ -222,9 +220,7 @@ def test_a_recipe_counts_wherever_it_stands(
 # ---- predict
 
 
-def test_scores_are_both_networks_probabilities_in_half_precision(
-    world: Path, tmp_path: Path
-) -> None:
+def test_scores_are_probabilities_of_both_networks_as_float16(world: Path, tmp_path: Path) -> None:
     options = f"--weights {world}/w.safetensors --out {tmp_path} --scores --sequences 08"
     succeed(f"predict {world}/data {options}")
 
@@ -301,9 +297,7 @@ def test_sequences_that_are_named_are_scored(world: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("name", "predictions"), [("semantickitti", "."), ("nuscenes", "results")])
-def test_the_golden_sets_score_as_the_official_tools_say(
-    name: str, predictions: str, tmp_path: Path
-) -> None:
+def test_golden_sets_score_as_the_tools_say(name: str, predictions: str, tmp_path: Path) -> None:
     data = GOLDEN / name
     out = tmp_path / "m.json"
     options = ("--predictions", data / predictions, "--json", out)
@@ -355,9 +349,7 @@ def test_bench_times_every_stage(world: Path, capsys: pytest.CaptureFixture[str]
         assert stage in text
 
 
-def test_benchs_figures_add_up(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bench_figures_add_up(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock that goes on by a millisecond whenever it is read."""
     ticks = itertools.count()
     clock = SimpleNamespace(perf_counter=lambda: next(ticks) / 1000)

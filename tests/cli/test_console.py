@@ -131,9 +131,7 @@ SINKS = ("> /dev/full", "| true", ">&-", "> /dev/full 2> /dev/full")
 
 @pytest.mark.parametrize("sink", with_quick(SINKS, SINKS[:2]))
 @pytest.mark.parametrize("command", with_full(COMMANDS, ["predict"]))
-def test_the_work_goes_on_without_a_reader(
-    command: str, sink: str, world: Path, tmp_path: Path
-) -> None:
+def test_work_goes_on_without_reader(command: str, sink: str, world: Path, tmp_path: Path) -> None:
     words = COMMANDS[command].format(w=world, out=tmp_path)
     code, _, error = amvnet(f"set -o pipefail; $AMVNET {command} {words} {sink}")
     assert code == 0

@@ -121,9 +121,7 @@ def test_help_is_in_words(command: str, capsys: pytest.CaptureFixture[str]) -> N
     assert max(map(len, text.splitlines())) <= 120
 
 
-def test_the_help_of_train_has_every_value_of_the_recipe_with_its_meaning(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_help_of_train_explains_every_recipe_value(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["train", "simulated-compact", "--help-all"])
     text = " ".join(capsys.readouterr().out.split())
@@ -171,9 +169,7 @@ def test_an_empty_recipe_is_refused(tmp_path: Path) -> None:
         refused(f"train {path} --data x --out o", "found an empty file")
 
 
-def test_an_error_of_the_disk_without_a_reason_says_what_is_known(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_disks_error_without_a_reason_says_what_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise OSError("1000 requested and 0 written")
 

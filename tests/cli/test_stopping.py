@@ -194,9 +194,7 @@ def check_it_goes_on(world: Path, folder: Path) -> None:
         assert path.read_bytes() == (parts / path.name).read_bytes()
 
 
-def test_a_stopped_predict_goes_on(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_predict_is_resumable(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     add = Journal.add
     added: list[Entry] = []
 

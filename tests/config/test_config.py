@@ -117,9 +117,7 @@ def test_the_recipes_of_the_benchmarks_have_the_papers_head(recipe: str, size: s
         ("7: seven", "7"),
     ],
 )
-def test_a_wrong_key_or_value_is_an_input_error_that_names_it(
-    tmp_path: Path, text: str, pattern: str
-) -> None:
+def test_an_input_error_names_a_wrong_key_or_value(tmp_path: Path, text: str, pattern: str) -> None:
     with pytest.raises(InputError, match=f"mine.yaml.*{pattern}") as error:
         load_recipe(write_recipe(tmp_path, text))
     assert "\n" not in str(error.value)
@@ -211,9 +209,7 @@ def test_a_users_file_may_build_on_another_users_file(tmp_path: Path) -> None:
         "training: {augment: {paste: 1.1}}",
     ],
 )
-def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(
-    tmp_path: Path, text: str
-) -> None:
+def test_a_number_out_of_its_range_gets_an_error_with_the_range(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError, match=r"mine\.yaml: .*expected .* found .*correct the value"):
         load_recipe(write_recipe(tmp_path, text))
 

@@ -164,9 +164,7 @@ def test_nuscenes_without_labels_names_the_table_that_is_missing(tmp_path: Path)
 
 
 @pytest.mark.parametrize("has_folder", [False, True])
-def test_a_name_without_its_ending_is_that_of_the_yaml_file(
-    tmp_path: Path, has_folder: bool
-) -> None:
+def test_a_name_without_an_ending_is_of_the_yaml_file(tmp_path: Path, has_folder: bool) -> None:
     (tmp_path / "mine.yaml").write_text("classes: {a: 1}\n")
     if has_folder:
         (tmp_path / "mine").mkdir()
@@ -295,9 +293,7 @@ def test_nuscenes_tables_that_cannot_be_used(tmp_path: Path) -> None:
     fails(lambda: open_dataset(layout.spec), samples)
 
 
-def test_nuscenes_scans_are_in_the_order_of_time_whatever_the_order_of_the_table(
-    tmp_path: Path,
-) -> None:
+def test_nuscenes_scans_are_in_the_order_of_time_whatever_the_tables_is(tmp_path: Path) -> None:
     layout = make_nuscenes(tmp_path)
     expected = open_dataset(layout.spec).records(layout.sequences)
     path = tmp_path / "v1.0-mini/sample_data.json"

@@ -82,9 +82,7 @@ def test_a_broken_sweep_is_one_line(tmp_path: Path) -> None:
             read_cloud(path)
 
 
-def test_feather_without_its_package_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_feather_needs_a_named_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.feather"
     path.write_bytes(b"ARROW1\0\0")
     monkeypatch.setitem(sys.modules, "pyarrow", None)

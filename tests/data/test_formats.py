@@ -341,9 +341,7 @@ def test_times_before_the_coordinates_are_not_called_a_map(tmp_path: Path, name:
         ("a_lidarseg.bin", bytes(64), "labels"),
     ],
 )
-def test_files_that_are_no_scans_are_called_what_they_are(
-    tmp_path: Path, name: str, data: bytes, kind: str
-) -> None:
+def test_files_of_other_kinds_are_named(tmp_path: Path, name: str, data: bytes, kind: str) -> None:
     path = tmp_path / name
     path.write_bytes(data)
     fails(lambda: read_scan(path), path, f"found {kind};")
@@ -698,9 +696,7 @@ def _las(path: Path, kind: str, offset: int, value: int) -> bytes:
     return bytes(content)
 
 
-def test_headers_that_claim_billions_are_refused_before_memory_is_taken(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_claimed_billions_are_refused_before_memory_is_taken(folder: Path, tmp_path: Path) -> None:
     contents = {
         "a.pcd": _pcd(MANY, "binary"),
         "b.pcd": _pcd(MANY, "ascii"),

@@ -58,9 +58,7 @@ def test_a_missing_yaml_file_is_not_called_a_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.int64])
-def test_labels_are_read_from_files_of_integers_of_any_size(
-    site: Path, dtype: type[np.integer[Any]]
-) -> None:
+def test_labels_are_integers_of_any_size(site: Path, dtype: type[np.integer[Any]]) -> None:
     np.save(site / "a.npy", some_points())
     RAW.astype(dtype).tofile(site / "a.label")
     np.testing.assert_array_equal(only_scan(site.parent), EXPECTED)
@@ -228,9 +226,7 @@ def test_named_sequences_are_not_used_for_the_other_purpose(tmp_path: Path) -> N
     fails(lambda: to_train(data, ["d"], None), "two sequences", "name them")
 
 
-def test_evaluate_scores_the_scans_that_train_validates_with(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_scores_the_val_scans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sites(tmp_path)
     predictions = tmp_path / "predictions/d"
     predictions.mkdir(parents=True)
@@ -371,9 +367,7 @@ def test_folders_may_be_named_as_numbers_and_dates(tmp_path: Path, name: str) ->
         ({"split": {"vall": "a"}}, "found 'vall'; did you mean val?"),
     ],
 )
-def test_mistakes_in_the_file_are_said_in_one_line(
-    site: Path, changes: dict[str, Any], word: str
-) -> None:
+def test_mistakes_in_the_file_are_one_line(site: Path, changes: dict[str, Any], word: str) -> None:
     np.save(site / "a.npy", some_points())
     path = describe(site.parent, **changes)
     fails(lambda: open_own(path), path.name if word != "found none" else word, word)

@@ -63,9 +63,7 @@ def test_every_format_gives_the_same_poses(tmp_path: Path, write: Callable[[Path
         lambda text: "time, x, y, z, qx, qy, qz, qw\n" + text,
     ],
 )
-def test_a_bom_commas_and_names_of_columns_change_nothing(
-    tmp_path: Path, spoil: Callable[[str], str]
-) -> None:
+def test_a_bom_commas_and_names_change_nothing(tmp_path: Path, spoil: Callable[[str], str]) -> None:
     path = write_tum(tmp_path / "tum.txt")
     lines = path.read_text().splitlines()[1:]
     path.write_text(spoil("\n".join(lines)), encoding="utf-8")
@@ -159,9 +157,7 @@ def test_poses_of_nuscenes_are_those_of_the_car_and_of_its_sensor() -> None:
 
 @pytest.mark.parametrize("table", ["ego_pose", "calibrated_sensor"])
 @pytest.mark.parametrize(("key", "value"), [("token", "no such"), ("rotation", ["a"] * 4)])
-def test_wrong_tables_of_poses_of_nuscenes_are_one_line(
-    tmp_path: Path, table: str, key: str, value: Any
-) -> None:
+def test_wrong_pose_tables_are_one_line(tmp_path: Path, table: str, key: str, value: Any) -> None:
     root = shutil.copytree(GOLDEN / "nuscenes", tmp_path / "nuscenes")
     path = root / f"v1.0-mini/{table}.json"
     rows = json.loads(path.read_text())
@@ -203,9 +199,7 @@ def test_times_that_do_not_overlap_are_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scans", ["s", "ms", "us", "ns"])
 @pytest.mark.parametrize("poses", ["s", "ms", "us", "ns"])
-def test_times_in_other_units_are_one_line_that_says_so(
-    tmp_path: Path, scans: str, poses: str
-) -> None:
+def test_times_in_other_units_are_called_so(tmp_path: Path, scans: str, poses: str) -> None:
     powers = {"s": 0, "ms": 3, "us": 6, "ns": 9}
     first = 1_700_000_000
     file = read_poses(write_tum(tmp_path / "tum.txt", first=first))

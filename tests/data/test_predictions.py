@@ -145,7 +145,5 @@ def test_a_mistake_is_named_in_one_line(name: str, predictions: Predictions) -> 
 
 @pytest.mark.parametrize("name", SEMANTICKITTI_MISTAKES)
 @pytest.mark.parametrize("predictions", ["semantickitti"], indirect=True)
-def test_a_mistake_in_four_byte_ids_is_named_in_one_line(
-    name: str, predictions: Predictions
-) -> None:
+def test_a_mistake_in_four_byte_ids_is_one_line(name: str, predictions: Predictions) -> None:
     check_mistake(predictions, SEMANTICKITTI_MISTAKES[name])

@@ -49,9 +49,7 @@ def test_one_process_serves_all_files_and_threads(bag: Path, tmp_path: Path) -> 
     assert process_id() == first
 
 
-def test_relative_paths_are_those_of_this_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_relative_paths_are_this_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a", "b"):
         folder = tmp_path / name
         folder.mkdir()
@@ -63,9 +61,7 @@ def test_relative_paths_are_those_of_this_process(
 @pytest.mark.parametrize(
     "number", [pytest.param(signal.SIGKILL, marks=pytest.mark.full), signal.SIGXCPU]
 )
-def test_a_file_that_ends_the_process_does_not_end_the_next(
-    bag: Path, number: signal.Signals
-) -> None:
+def test_a_file_that_ends_its_process_spares_the_next(bag: Path, number: signal.Signals) -> None:
     scans = list(list_scans(bag))
     scans[0].read()
     os.kill(process_id(), signal.SIGSTOP)
@@ -79,9 +75,7 @@ def test_a_file_that_ends_the_process_does_not_end_the_next(
         np.testing.assert_array_equal(scan.read().to_scan().points, points)
 
 
-def test_an_interruption_does_not_mix_up_replies(
-    bag: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interruption_mixes_up_no_replies(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second, *_ = list_scans(bag)
 
     def interrupt(text: str) -> None:

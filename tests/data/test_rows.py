@@ -105,9 +105,7 @@ def test_lost_returns_may_have_any_value_that_is_no_place(
 
 
 @pytest.mark.parametrize("columns", [4, 5])
-def test_a_truncated_file_is_not_read_with_other_columns(
-    table: np.ndarray, tmp_path: Path, columns: int
-) -> None:
+def test_a_truncated_file_keeps_columns(table: np.ndarray, tmp_path: Path, columns: int) -> None:
     content = row_bytes(table[:, :columns], "float32")
     path = tmp_path / "a.bin"
     for removed in range(1, columns):
@@ -121,9 +119,7 @@ def test_values_that_fit_nothing_are_refused_and_both_options_named(tmp_path: Pa
     fails(lambda: read_cloud(path), path, "--columns x,y,z,intensity,ring", "--dtype float32")
 
 
-def test_rows_of_nothing_but_coordinates_are_asked_for_by_name(
-    table: np.ndarray, tmp_path: Path
-) -> None:
+def test_rows_of_coordinates_are_asked_for_by_name(table: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     # The size may be a multiple of KITTI's or nuScenes' rows, or not.
     for left_out in reversed(range(5)):
@@ -133,9 +129,7 @@ def test_rows_of_nothing_but_coordinates_are_asked_for_by_name(
     np.testing.assert_array_equal(cloud.xyz, table[:, :3].astype("f4"))
 
 
-def test_a_file_that_ends_within_a_row_is_called_truncated(
-    table: np.ndarray, tmp_path: Path
-) -> None:
+def test_a_file_that_ends_in_a_row_is_called_truncated(table: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     data = row_bytes(table[:, :4], "float32")
     assert len(data) > 5000
@@ -143,18 +137,14 @@ def test_a_file_that_ends_within_a_row_is_called_truncated(
     fails(lambda: read_cloud(path), path, f"{len(data) - 1} bytes", "copy the file again")
 
 
-def test_a_table_that_was_written_column_by_column_is_refused(
-    table: np.ndarray, tmp_path: Path
-) -> None:
+def test_a_table_written_column_by_column_is_refused(table: np.ndarray, tmp_path: Path) -> None:
     """As the scans of Oxford RobotCar are: all x, then all y and so on."""
     path = tmp_path / "a.bin"
     path.write_bytes(row_bytes(table[:, :4].T, "float32"))
     fails(lambda: read_cloud(path), path, "found values that fit neither")
 
 
-def test_rows_in_millimetres_are_read_if_the_user_names_the_columns(
-    table: np.ndarray, tmp_path: Path
-) -> None:
+def test_rows_in_millimetres_are_read_by_named_columns(table: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     rows = table[:, :4] * [1000, 1000, 1000, 1]
     path.write_bytes(row_bytes(rows, "float32"))
@@ -275,9 +265,7 @@ def test_text_is_read_with_any_separator_and_name(
 
 
 @pytest.mark.parametrize("end", [",\n", ";\n", " \n", "\r"])
-def test_text_is_read_with_any_end_of_its_lines(
-    table: np.ndarray, tmp_path: Path, end: str
-) -> None:
+def test_text_is_read_with_any_ends_of_lines(table: np.ndarray, tmp_path: Path, end: str) -> None:
     path = tmp_path / "a.csv"
     separator = end[0] if end[0] in ",;" else " "
     path.write_bytes(text_of(table[:50], separator).replace("\n", end).encode())

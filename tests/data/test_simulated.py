@@ -167,9 +167,7 @@ def test_each_epoch_has_other_streets(tmp_path: Path) -> None:
     assert dataset.at_epoch(train, 1) == dataset.records(["1139"])[4]
 
 
-def test_the_street_of_a_faster_process_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_faster_process_street_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = SimulatedStreets(tmp_path)
     record = dataset.records(["5"])[0]
 
@@ -183,9 +181,7 @@ def test_the_street_of_a_faster_process_is_kept(
     assert streets(tmp_path) == ["000005"]
 
 
-def test_a_street_that_fails_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_street_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = SimulatedStreets(tmp_path)
 
     def broken(*arguments: Any) -> Iterator[SimulatedScan]:
@@ -198,9 +194,7 @@ def test_a_street_that_fails_leaves_nothing(
     assert streets(tmp_path) == []
 
 
-def test_the_streets_read_the_longest_time_ago_make_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_streets_read_long_ago_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = SimulatedStreets(tmp_path)
     records = [dataset.records([str(number)])[0] for number in range(6)]
     for age, record in enumerate(records[:4]):
@@ -259,9 +253,7 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
-    workers: int, tmp_path: Path
-) -> None:
+def test_any_number_of_workers_gives_the_same_fresh_streets(workers: int, tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path)
     config = AugmentConfig(mix=0.5, laser_mix=0.5, paste=0.5)
     scans = ScanSet(data_of(dataset, "0", "1"), Expectation(), config)
@@ -288,9 +280,7 @@ def test_validation_has_the_same_streets_in_every_epoch(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES])
-def test_objects_to_paste_are_rare_classes_of_both_benchmarks(
-    taxonomy: Taxonomy, tmp_path: Path
-) -> None:
+def test_objects_to_paste_are_rare_classes_of_each_set(taxonomy: Taxonomy, tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path, "hdl64e" if taxonomy is SEMANTICKITTI else "hdl32e")
     scans = ScanSet(data_of(dataset), Expectation())
     names = {taxonomy.classes[train_id - 1] for train_id in scans.pasted}

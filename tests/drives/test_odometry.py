@@ -38,9 +38,7 @@ def moved_back(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("factor", "words"), [(1.25, "0.8 times"), (0.8, "1.25 times")])
 @pytest.mark.parametrize("motion", [{"metres": 4.0}, {"degrees": 20.0}])
-def test_the_message_names_the_motion_that_fits_better(
-    factor: float, words: str, motion: dict[str, float]
-) -> None:
+def test_the_better_motion_is_named(factor: float, words: str, motion: dict[str, float]) -> None:
     after = moved_back(posts(), motion_of(**motion))
     check_fit([Pair(posts(), after, motion_of(**motion))], *NAMED)
     wrong = motion_of(**{name: factor * value for name, value in motion.items()})

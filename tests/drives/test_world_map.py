@@ -237,9 +237,7 @@ def test_a_map_that_was_stopped_is_resumed_to_the_same_map(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.ply", "whole.ply"]
 
 
-def test_a_map_is_not_resumed_if_anything_is_other_that_its_scores_depend_on(
-    world: Path, tmp_path: Path
-) -> None:
+def test_a_map_is_not_resumed_if_what_it_depends_on_changed(world: Path, tmp_path: Path) -> None:
     shutil.copytree(world / "data", tmp_path / "data")
     request = LabellingRequest(fresh_weights(), precision="float32")
     scans, _ = find_inputs([f"{tmp_path}/data"]).scans()
@@ -288,9 +286,7 @@ def test_a_map_may_have_the_longest_name(world: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"PK\x03\x04", {"done": 2}, {"request": "other"}])
-def test_an_unfinished_map_that_cannot_be_read_is_begun_anew(
-    tmp_path: Path, content: bytes | dict[str, object]
-) -> None:
+def test_unreadable_maps_begin_anew(tmp_path: Path, content: bytes | dict[str, object]) -> None:
     path = tmp_path / ".map.ply.unfinished.npz"
     if isinstance(content, bytes):
         path.write_bytes(content)

@@ -101,9 +101,7 @@ class SlicesWithoutCuda(TorchFunctionMode):
 @each_network
 @pytest.mark.filterwarnings("ignore:PyTorch was compiled without cuDNN")  # a build for CPUs
 @pytest.mark.filterwarnings("ignore:Accessing the data pointer of FakeTensor")  # torch < 2.9
-def test_a_network_copies_nothing_from_the_host_and_no_shape_depends_on_data(
-    build: Build, shape: tuple[int, ...]
-) -> None:
+def test_networks_copy_nothing_and_have_fixed_shapes(build: Build, shape: tuple[int, ...]) -> None:
     net = build().eval()
     freeze(net)
     # A shape that depends on data raises an error.

@@ -133,9 +133,7 @@ def test_what_makes_a_small_model_fast_leaves_the_labels_as_they_are(taxonomy: T
 
 @pytest.mark.full
 @pytest.mark.parametrize(("weights", "data"), weights_and_data())
-def test_what_makes_it_fast_leaves_the_labels_as_they_are(
-    tmp_path: Path, weights: str, data: str
-) -> None:
+def test_what_makes_it_fast_leaves_the_labels(tmp_path: Path, weights: str, data: str) -> None:
     if data.startswith("simulated:"):
         pytest.importorskip("embreex")
         sensor = data.removeprefix("simulated:")

@@ -100,9 +100,7 @@ def column(path: Path, name: str) -> list[str]:
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.31, 0.85, SWEPT_BINS / BINS])
-def test_a_swept_tau_gives_what_weights_with_that_tau_give(
-    dataset: Dataset, weights: Weights, tau: float
-) -> None:
+def test_a_swept_tau_equals_weights_with_it(dataset: Dataset, weights: Weights, tau: float) -> None:
     value, uncertain, miou, accuracy = analyze_08(dataset, weights).sweep()[round(tau * BINS)]
     share, expected = figures_of(dataset, with_tau(weights, tau))
     assert value == pytest.approx(tau)
@@ -310,9 +308,7 @@ def test_ablate_scores_on_the_gpu_of_its_process(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.full
-def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(
-    world: Path, tmp_path: Path
-) -> None:
+def test_ablate_trains_four_networks_and_goes_on_later(world: Path, tmp_path: Path) -> None:
     out = tmp_path / "ablation"
     options = f"--out {out} --training.rv.epochs 1"
     command = f"ablate {world}/recipe.yaml --data {world}/data {options}"

@@ -257,9 +257,7 @@ def test_scans_without_labels_are_refused(world: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("weights", "word"), [("rv", "polar_net"), ("nuscenes", "classes"), ("none", "weights file")]
 )
-def test_wrong_input_is_one_line_and_leaves_nothing(
-    world: Path, tmp_path: Path, weights: str, word: str
-) -> None:
+def test_wrong_input_leaves_one_line(world: Path, tmp_path: Path, weights: str, word: str) -> None:
     options = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path / "next.csv")
     refused(("rank", world / "data", *options), word)
     assert not files(tmp_path)

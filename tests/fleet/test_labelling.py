@@ -164,9 +164,7 @@ def test_a_scan_that_is_gone_is_a_broken_one(labelling: LabellingRequest, tmp_pa
         assert "output folder" not in row["error"]
 
 
-def test_a_scan_in_the_output_folder_is_not_replaced(
-    labelling: LabellingRequest, tmp_path: Path
-) -> None:
+def test_a_scan_in_the_output_is_not_replaced(labelling: LabellingRequest, tmp_path: Path) -> None:
     """In a pipeline of one's own, nobody has listed the scans."""
     points, _ = street(0)
     path = tmp_path / "a.ply"
@@ -252,9 +250,7 @@ def test_names_in_a_manifest_write_nothing_elsewhere(
             results.add_drives(MeasureSensors(request)(block))
 
 
-def test_what_is_no_scan_file_is_a_broken_scan_in_one_line(
-    labelling: LabellingRequest, tmp_path: Path
-) -> None:
+def test_what_is_no_scan_is_a_broken_scan(labelling: LabellingRequest, tmp_path: Path) -> None:
     """A folder, a bag, a name that leads out of the output folder, a storage that is not there."""
     (tmp_path / "folder").mkdir()
     (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
@@ -324,9 +320,7 @@ def test_a_bucket_that_takes_no_labels_is_fatal(
     assert row["error"].startswith("s3://no-such-bucket/out/000000.label: ")
 
 
-def test_the_row_of_a_scan_counts_its_labels(
-    labelling: LabellingRequest, fleet: Path, tmp_path: Path
-) -> None:
+def test_a_row_counts_its_labels(labelling: LabellingRequest, fleet: Path, tmp_path: Path) -> None:
     rows = label(labelling, str(tmp_path), [f"{fleet}/scans/drive0"])
     for row in rows:
         raw = np.fromfile(row["labels"], np.uint32)

@@ -130,9 +130,7 @@ def test_a_manifest_without_paths_is_refused_in_one_line(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("ending", manifest.MANIFESTS)
-def test_a_manifest_with_a_column_twice_or_a_row_without_a_path_is_refused_in_one_line(
-    tmp_path: Path, ending: str
-) -> None:
+def test_a_manifest_needs_each_column_once_and_all_paths(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"m{ending}"
     twice = pa.Table.from_arrays([pa.array(["a.bin"]), pa.array(["b.bin"])], ["path", "path"])
     missing = pa.table({"path": ["a.bin", None], "name": ["a", "b"]})
@@ -266,9 +264,7 @@ class MadeUp(Place):
 
 
 @pytest.mark.full
-def test_the_memory_of_planning_does_not_grow_with_the_names(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_memory_of_a_plan_does_not_grow_with_names(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each name stay 8 bytes."""
     monkeypatch.setattr(Place, "of", lambda url: MadeUp(url, LocalFileSystem(), url))
 

@@ -193,9 +193,7 @@ def test_what_is_killed_is_made_up_for(
 
 @pytest.mark.usefixtures("hears_sigint")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_run_and_its_workers_with_one_line(
-    fleet: Path, bucket: Bucket, number: int
-) -> None:
+def test_a_signal_ends_all_with_one_line(fleet: Path, bucket: Bucket, number: int) -> None:
     out = f"stop-{number}"
     with held_labels(WRITTEN):
         process = subprocess.Popen(
@@ -293,9 +291,7 @@ def test_wrong_input_is_one_line_before_a_cluster_is_started(
         assert "pw" not in line
 
 
-def test_an_output_folder_that_cannot_be_used_is_one_line(
-    ray_here: None, fleet: Path, bucket: Bucket
-) -> None:
+def test_a_useless_output_folder_is_one_line(ray_here: None, fleet: Path, bucket: Bucket) -> None:
     other = save(fresh_weights(seed=1), fleet / "other.safetensors")
     out = "s3://fleet/earlier-2"
     Results(Place.of(out), LabellingRequest(load(fleet / "w.safetensors"), precision="float32"))
@@ -413,9 +409,7 @@ def rows_in(folder: Path) -> list[dict[str, object]]:
     return rows
 
 
-def test_a_scan_that_ends_its_workers_is_a_broken_one(
-    mortal: None, fleet: Path, tmp_path: Path
-) -> None:
+def test_a_scan_that_ends_workers_is_broken(mortal: None, fleet: Path, tmp_path: Path) -> None:
     run = run_in(fleet, tmp_path)
     label(run, scans_of("a", "1", "poison", "2", "3", "4"))
     rows = rows_in(tmp_path)
@@ -434,9 +428,7 @@ def test_workers_that_end_again_and_again_are_one_line(
     fails(lambda: label(run_in(fleet, tmp_path), scans_of("a", "poison", "1")), "expected workers")
 
 
-def test_a_full_disk_ends_the_run_and_keeps_what_is_done(
-    mortal: None, fleet: Path, tmp_path: Path
-) -> None:
+def test_a_full_disk_ends_it_and_keeps_labels(mortal: None, fleet: Path, tmp_path: Path) -> None:
     run = run_in(fleet, tmp_path)
     with pytest.raises(OSError, match="No space left") as caught:
         label(run, scans_of("a", "1", "2", "full", "3"))
@@ -471,9 +463,7 @@ def test_workers_that_cannot_start_are_one_line(
 # ---- many scans
 
 
-def test_windows_hold_as_many_scans_as_are_planned_together(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_windows_hold_as_many_scans_as_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "WINDOW", 3)
 
     def sizes(lengths: Sequence[int]) -> list[int]:

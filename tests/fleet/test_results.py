@@ -112,9 +112,7 @@ def test_no_rows_are_no_part(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("results/part-*"))
 
 
-def test_parts_are_written_by_size_and_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parts_are_written_by_size_or_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(results_module, "PART_SECONDS", 1000.0)
     results = Results(Place.of(str(tmp_path)), REQUEST)
     results.add(rows("a"))
@@ -201,17 +199,13 @@ def test_what_a_killed_run_left_half_written_is_taken_away(tmp_path: Path) -> No
     assert names == {"run.json", ".notes.part"}
 
 
-def test_a_place_that_cannot_be_written_is_refused_in_one_line(
-    tmp_path: Path, bucket: Bucket
-) -> None:
+def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, bucket: Bucket) -> None:
     (tmp_path / "file").touch()
     fails(lambda: Results(Place.of(f"{tmp_path}/file/out"), REQUEST), f"{tmp_path}/file")
     fails(lambda: Results(Place.of("s3://none/out"), REQUEST), "s3://none", "credentials")
 
 
-def test_a_storage_that_does_not_answer_is_refused_in_one_line(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_storage_without_an_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     class Unreachable(fs.FileSystem):
         @staticmethod
         def from_uri(uri: str) -> tuple[fs.FileSystem, str]:

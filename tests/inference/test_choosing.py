@@ -73,9 +73,7 @@ def test_the_classes_of_a_benchmark_go_before_the_lasers(sensor: str, classes: T
 
 @pytest.mark.parametrize(("sensor", "name"), CHOICES.items())
 @pytest.mark.parametrize("height", [1.7, 0.9])
-def test_the_lasers_of_the_first_recording_choose(
-    tmp_path: Path, sensor: str, name: str, height: float
-) -> None:
+def test_the_first_recording_chooses(tmp_path: Path, sensor: str, name: str, height: float) -> None:
     for folder, laser in (("a", sensor), ("b", "hdl32e")):
         (tmp_path / folder).mkdir()
         write(tmp_path / folder / "scan.npy", laser, height)
@@ -130,9 +128,7 @@ def test_scans_of_several_sensors_in_a_folder_choose_no_lasers(tmp_path: Path) -
     assert choice == (LAST, "as the scans are of several sensors")
 
 
-def test_evaluate_says_what_is_assumed_of_a_sensor(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_says_what_it_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scan = write(tmp_path / "scan.npy", "vlp16", 1.1)
     np.ones(len(np.load(scan)), np.uint32).tofile(tmp_path / "scan.label")
     text = "scans: '*.npy'\nlabels: .label\nclasses: {car: 1}\nsplit: {val: scan}\n"

@@ -110,9 +110,7 @@ def test_lost_returns_of_a_drive_get_no_label_and_move_no_pose(world: Path) -> N
         (JUMPING, ["m between the scans 1 and 2"]),
     ],
 )
-def test_too_few_or_impossible_poses_are_one_line(
-    world: Path, poses: Any, words: list[str]
-) -> None:
+def test_too_few_or_absurd_poses_are_one_line(world: Path, poses: Any, words: list[str]) -> None:
     segmenter = amvnet.load(world / "w.safetensors")
     scans = [points for points, _ in drive_scans(3)]
     fails(lambda: list(amvnet.drive(segmenter, scans, poses)), "poses", *words)
@@ -131,9 +129,7 @@ def test_networks_see_the_scans_in_reach_from_angles_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("seconds", [100.05, 1_700_000_000.25])
-def test_names_of_scans_in_nanoseconds_are_times(
-    world: Path, tmp_path: Path, seconds: float
-) -> None:
+def test_names_in_nanoseconds_are_times(world: Path, tmp_path: Path, seconds: float) -> None:
     """The poses lie between the scans."""
     track = []
     for index in range(-1, 12):
@@ -176,9 +172,7 @@ def test_an_interrupted_run_resumes_to_the_same_labels(
     assert labels_in(tmp_path) == labels_in(world / "labels")
 
 
-def test_scans_of_two_drives_that_alternate_are_fused_each_with_its_own(
-    world: Path, tmp_path: Path
-) -> None:
+def test_scans_of_two_drives_are_fused_each_with_its_own(world: Path, tmp_path: Path) -> None:
     words = []
     for drive in ("a", "b"):
         (tmp_path / drive).mkdir()
@@ -192,9 +186,7 @@ def test_scans_of_two_drives_that_alternate_are_fused_each_with_its_own(
     assert labels_in(tmp_path / "one_by_one") == labels_in(tmp_path / "apart")
 
 
-def test_a_scan_that_changed_is_labelled_again_with_all_scans_in_its_reach(
-    world: Path, tmp_path: Path
-) -> None:
+def test_a_changed_scan_is_labelled_again_with_its_reach(world: Path, tmp_path: Path) -> None:
     write_drive(tmp_path / "data")
     command = f"predict {tmp_path}/data --weights {world}/w.safetensors --drive --out {tmp_path}"
     succeed(f"{command}/resumed")
@@ -222,9 +214,7 @@ def test_a_drive_with_a_broken_scan_resumes_to_the_same_labels(world: Path, tmp_
 
 
 @pytest.mark.full
-def test_a_run_is_not_resumed_with_other_poses_or_past_scans_alone(
-    world: Path, tmp_path: Path
-) -> None:
+def test_other_poses_or_past_scans_alone_resume_no_run(world: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "poses.npy", POSES)
     out = tmp_path / "out"
     succeed(predict(world, out, f"--poses {tmp_path}/poses.npy"))
@@ -347,9 +337,7 @@ def test_poses_that_were_turned_by_a_calibration_say_so(world: Path, tmp_path: P
     fails(lambda: find_poses(scans, of_lidar), "poses.txt", "turned from the camera", "apart")
 
 
-def test_poses_that_were_estimated_are_not_to_be_estimated(
-    world: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_are_not_estimated_twice(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drive_module, "_estimated", lambda *_: stretched(POSES))
     scans, _ = find_inputs([f"{world}/data"]).scans()
     monkeypatch.setattr(type(scans[0].dataset), "poses", lambda *_: None)
@@ -358,9 +346,7 @@ def test_poses_that_were_estimated_are_not_to_be_estimated(
     fails(lambda: find_poses(scans), "the dataset", "correct them")
 
 
-def test_poses_of_ones_own_scans_move_the_points_of_their_files(
-    world: Path, tmp_path: Path
-) -> None:
+def test_poses_of_own_scans_move_the_points_of_files(world: Path, tmp_path: Path) -> None:
     turn = np.array(AXES["y-forward"], float)
     to_file = np.eye(4)
     to_file[:3] = np.column_stack((turn.T, (0.5, -0.3, 0.2)))  # axes and place of the file
@@ -470,9 +456,7 @@ def command_on(bag: Path, world: Path, out: Path, poses: object) -> str:
     return f"predict {bag} {words} --drive --poses {poses}"
 
 
-def test_odometry_of_a_bag_labels_as_a_file_of_the_same_poses(
-    world: Path, bag: Path, tmp_path: Path
-) -> None:
+def test_odometry_of_a_bag_equals_a_file_of_poses(world: Path, bag: Path, tmp_path: Path) -> None:
     lines = []
     for sent in drive_odometry(BAG_SCANS):
         pose = pose_at(sent.time)
@@ -488,9 +472,7 @@ def test_odometry_of_a_bag_labels_as_a_file_of_the_same_poses(
     assert len(files(folders[0])) == BAG_SCANS
 
 
-def test_a_topic_that_does_not_fit_is_one_line_and_nothing_is_written(
-    world: Path, bag: Path, tmp_path: Path
-) -> None:
+def test_a_topic_that_does_not_fit_leaves_one_line(world: Path, bag: Path, tmp_path: Path) -> None:
     refused(command_on(bag, world, tmp_path / "out", "/odometry"), "/odom (nav_msgs/msg/Odometry)")
     standing = [odometry(sent.time, np.eye(4)) for sent in drive_odometry(BAG_SCANS)]
     other = write_bag(tmp_path / "standing", [*standing, *drive_clouds(BAG_SCANS)])

@@ -356,9 +356,7 @@ def test_the_onnx_runner_gives_a_scan_the_same_labels(runner: OnnxSegmenter, nam
 
 
 @pytest.mark.parametrize("keep_own", [False, True])
-def test_every_entry_leaves_the_own_car_without_a_label_unless_told_to_keep_it(
-    by_laser: World, keep_own: bool
-) -> None:
+def test_every_entry_labels_the_own_car_only_if_told_to(by_laser: World, keep_own: bool) -> None:
     points, laser = on_nuscenes_car()
     points[0, 3] = 1
     points = np.column_stack([points, laser])
@@ -372,9 +370,7 @@ def test_every_entry_leaves_the_own_car_without_a_label_unless_told_to_keep_it(
 
 
 @pytest.mark.parametrize("keep_own", [False, True])
-def test_official_predictions_and_scores_of_nuscenes_label_the_own_car(
-    tmp_path: Path, keep_own: bool
-) -> None:
+def test_what_is_official_of_nuscenes_labels_the_own_car(tmp_path: Path, keep_own: bool) -> None:
     """Its server wants a class for each point, and some of its labels call this body a car."""
     layout = make_nuscenes(tmp_path / "data")
     points, laser = on_nuscenes_car()
@@ -656,9 +652,7 @@ QUICK_ODD = ("shuffled", "lost returns at zero", "reversed rings", "8 bits", "ti
 
 
 @pytest.mark.parametrize("name", with_quick(ODD, QUICK_ODD))
-def test_every_entry_gives_the_networks_the_same_points_and_rows(
-    by_laser: World, name: str
-) -> None:
+def test_every_entry_gives_networks_the_same_points_and_rows(by_laser: World, name: str) -> None:
     """Those that normalise agree, and so do the others; the rings of a scan change nothing."""
     odd = ODD[name]
     points = odd.make()
@@ -722,9 +716,7 @@ def test_rings_that_are_not_in_order_are_said(by_laser: World, name: str) -> Non
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("cm", 100.0), ("ft", 1 / 0.3048)])
-def test_arrays_in_other_units_are_refused_or_normalised_by_the_sensor(
-    by_laser: World, unit: str, factor: float
-) -> None:
+def test_arrays_in_other_units_need_a_sensor(by_laser: World, unit: str, factor: float) -> None:
     points = in_order()
     scaled = points * np.array([factor, factor, factor, 1])
     for entry in (by_list, by_fields, by_many, by_runner):
@@ -749,9 +741,7 @@ def test_arrays_in_other_units_are_refused_or_normalised_by_the_sensor(
         {"rotate": (0.0, 9.0, 0.0), "offset": (0.0, 0.0, 0.5)},
     ],
 )
-def test_a_scan_that_is_moved_and_moved_back_keeps_the_rows_of_its_lasers(
-    by_laser: World, how: dict[str, Any]
-) -> None:
+def test_a_scan_moved_and_moved_back_keeps_its_rows(by_laser: World, how: dict[str, Any]) -> None:
     points = turned(Scan(in_order()), 0.003).points  # so that no point is on the axis
     expected = by_laser.segmenter(by_laser.write(points))
     sensor = Sensor(**how)
@@ -841,9 +831,7 @@ def test_negative_intensities_are_named_with_their_number(saved: World) -> None:
 
 @pytest.mark.parametrize("value", with_full([np.nan, np.inf], [np.inf]))
 @pytest.mark.parametrize("share", with_full([1.0, 0.999, 0.6], [0.6]))
-def test_intensities_of_which_most_are_missing_are_none(
-    saved: World, value: float, share: float
-) -> None:
+def test_intensities_mostly_missing_are_none(saved: World, value: float, share: float) -> None:
     points = plain()
     points[: round(share * len(points)), 3] = value
     with no_warnings():

@@ -312,9 +312,7 @@ def head(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.full
-def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(
-    world: Path, head: Path, tmp_path: Path
-) -> None:
+def test_a_head_for_files_is_that_of_networks(world: Path, head: Path, tmp_path: Path) -> None:
     # Without the world's head, which would be trained further
     networks = tmp_path / "networks.safetensors"
     save(without(fresh_weights(), "point_head"), networks)
@@ -331,9 +329,7 @@ def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(
 
 
 @pytest.mark.full
-def test_the_weights_hold_only_the_head_and_fuse_takes_them(
-    world: Path, head: Path, tmp_path: Path
-) -> None:
+def test_fuse_takes_the_weights_of_the_head_alone(world: Path, head: Path, tmp_path: Path) -> None:
     weights = load(head)
     assert weights.parts == ("point_head",)
     assert weights.model.assertion == fresh_weights().model.assertion

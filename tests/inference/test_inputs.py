@@ -69,9 +69,7 @@ def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]
     ("first", "second"),
     with_quick([("vlp16", "os1-64"), ("os1-64", "hdl32e")], [("vlp16", "os1-64")]),
 )
-def test_if_the_first_scans_of_a_folder_differ_each_is_measured_alone(
-    tmp_path: Path, first: str, second: str
-) -> None:
+def test_if_first_scans_differ_each_is_measured(tmp_path: Path, first: str, second: str) -> None:
     for seed in range(MEASURED_SCANS + 1):
         sensor, height = (first, 0.9) if seed < 3 else (second, 1.3)
         write(tmp_path / "both", f"s{seed}", sensor, height, seed)
@@ -87,9 +85,7 @@ def test_if_the_first_scans_of_a_folder_differ_each_is_measured_alone(
         assert "has scans of other sensors, so that each is measured alone" in line
 
 
-def test_a_scan_of_another_sensor_after_the_first_ones_is_measured_alone_and_told(
-    tmp_path: Path,
-) -> None:
+def test_a_later_scan_of_another_sensor_is_measured_alone_and_told(tmp_path: Path) -> None:
     for seed in range(MEASURED_SCANS + 2):
         write(tmp_path / "both", f"a{seed}", "os1-64", 1.0, seed)
     write(tmp_path / "both", "b", "vlp16", 2.5)
@@ -342,9 +338,7 @@ def test_an_array_without_intensity_gets_those_that_the_weights_need_and_a_warni
         (POINTS, "x,y,z,intensity,ring", "5 columns"),
     ],
 )
-def test_an_array_of_another_shape_is_refused(
-    array: np.ndarray, columns: str | None, word: str
-) -> None:
+def test_arrays_of_other_shapes_fail(array: np.ndarray, columns: str | None, word: str) -> None:
     fails(lambda: array_cloud(array, parse_layout(columns)), "expected", word)
 
 

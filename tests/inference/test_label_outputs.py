@@ -211,9 +211,7 @@ def test_open3d_keeps_all_columns_of_a_ply(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["las", "laz"])
 @pytest.mark.parametrize("count", [0, COUNT])
-def test_files_of_las_are_as_its_version_1_4_wants_them(
-    kind: str, count: int, tmp_path: Path
-) -> None:
+def test_files_of_las_are_as_version_1_4_wants(kind: str, count: int, tmp_path: Path) -> None:
     """Of its revision 15, what holds for the point formats from 6 on."""
     xyz, ids, uncertain = make_scan()
     path = write_scan_labels(
@@ -261,9 +259,7 @@ def test_an_existing_file_survives_a_write_that_fails(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_disk_without_space_is_an_error_of_the_system_that_names_the_file(
-    kind: str, tmp_path: Path
-) -> None:
+def test_a_disk_without_space_is_an_error_that_names_the_file(kind: str, tmp_path: Path) -> None:
     """Libraries hide the reason, and NumPy ignores it in the last block of a file."""
     xyz = np.random.default_rng(0).normal(scale=20, size=(5000, 3))
     ids = np.ones(len(xyz), np.uint8)
@@ -287,9 +283,7 @@ def test_an_unknown_format_is_named() -> None:
 
 
 @pytest.mark.parametrize("missing", ["laspy", "lazrs"])
-def test_a_missing_package_is_named_before_the_work(
-    missing: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named_early(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
     for check in (lambda: check_kind("laz"), lambda: check_ending(Path("a.laz"))):
         fails(check, "laz", missing, 'pip install "amvnet[formats]"')
@@ -345,9 +339,7 @@ def test_predict_writes_the_points_of_the_file_though_the_network_gets_others(
             check_coordinates(kind, content.xyz, xyz)
 
 
-def test_uncertain_points_are_those_of_the_segmenter(
-    world: Path, recorded: Path, tmp_path: Path
-) -> None:
+def test_uncertain_points_are_the_segmenters(world: Path, recorded: Path, tmp_path: Path) -> None:
     options = ("--uncertain", "--sequences", "08", "--format", "ply")
     assert predict(world, tmp_path, world / "data", recorded / "scans", *options)[0] == 0
 

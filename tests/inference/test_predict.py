@@ -97,9 +97,7 @@ def settings_of(world: Path) -> dict[str, object]:
 # ---- broken scans
 
 
-def test_broken_scans_are_listed_and_the_others_are_segmented(
-    world: Path, whole: Path, tmp_path: Path
-) -> None:
+def test_broken_scans_are_listed_others_labelled(world: Path, whole: Path, tmp_path: Path) -> None:
     scans = tmp_path / "scans"
     shutil.copytree(world / "scans", scans)
     (scans / "000003.bin").write_bytes(b"123")
@@ -212,9 +210,7 @@ sys.exit(main())
 
 @pytest.mark.full
 @pytest.mark.parametrize("kills", [1, 2])
-def test_a_killed_run_goes_on_where_it_stopped(
-    world: Path, whole: Path, tmp_path: Path, kills: int
-) -> None:
+def test_a_killed_run_goes_on_later(world: Path, whole: Path, tmp_path: Path, kills: int) -> None:
     """After SIGKILL, no scan is segmented again, and the labels are the same."""
     out = tmp_path / "out"
     command = predict(world, out, "--resume")
@@ -315,9 +311,7 @@ def grow(folder: Path, seeds: Iterable[int]) -> set[str]:
     return {f"{seed:06d}.label" for seed in seeds}
 
 
-def test_a_finished_run_makes_only_labels_that_are_gone(
-    world: Path, whole: Path, tmp_path: Path
-) -> None:
+def test_a_finished_run_makes_only_lost_labels(world: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(whole, out)
     command = predict(world, out, "--resume")
@@ -332,9 +326,7 @@ def test_a_finished_run_makes_only_labels_that_are_gone(
     assert changed == {"000003.label"}
 
 
-def test_a_run_that_repeats_some_scans_leaves_the_others_to_resume(
-    world: Path, whole: Path, tmp_path: Path
-) -> None:
+def test_a_run_repeats_scans_and_keeps_the_others(world: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(whole, out)
     succeed(f"predict {world}/scans/000003.bin --weights {world}/{WEIGHTS} --out {out} --overwrite")
@@ -358,9 +350,7 @@ def test_a_scan_that_lacks_one_of_its_files_is_segmented_again(world: Path, tmp_
         assert files(tmp_path / "out") == written
 
 
-def test_scans_before_the_first_ones_change_how_all_are_normalised(
-    world: Path, whole: Path, tmp_path: Path
-) -> None:
+def test_scans_before_the_first_normalise_all(world: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     scans = tmp_path / "scans"
     shutil.copytree(world / "scans", scans)
@@ -402,9 +392,7 @@ def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) 
 ENTRIES = [Entry(name, "0f", "drive", 10, 3, [1]) for name in "ab"]
 
 
-def test_a_folder_takes_other_scans_of_a_run_with_other_settings_only_if_told_so(
-    world: Path, tmp_path: Path
-) -> None:
+def test_a_folder_mixes_runs_of_other_settings_only_if_told_so(world: Path, tmp_path: Path) -> None:
     command = f"--weights {world}/{WEIGHTS} --out {tmp_path}"
     succeed(f"predict {world}/scans/000000.bin {command}")
     succeed(f"predict {world}/scans/000001.bin {command}")
@@ -547,9 +535,7 @@ def test_a_run_replaces_no_labels_of_a_run_that_ended_while_it_loaded_its_networ
     assert settings["method"] == "rv"
 
 
-def test_what_a_killed_run_left_half_written_is_taken_away(
-    world: Path, whole: Path, tmp_path: Path
-) -> None:
+def test_what_is_left_half_written_is_taken_away(world: Path, whole: Path, tmp_path: Path) -> None:
     (tmp_path / ".notes.part").write_text("a user's own file")
     with atomic_write(tmp_path / "000000.label") as part:
         part.write_bytes(b"complete")
@@ -565,9 +551,7 @@ def test_what_a_killed_run_left_half_written_is_taken_away(
 
 
 @pytest.mark.parametrize("at_once", with_full([1, 3], [3]))
-def test_few_scans_are_in_memory_however_many_there_are(
-    world: Path, tmp_path: Path, at_once: int
-) -> None:
+def test_few_scans_are_in_memory_at_a_time(world: Path, tmp_path: Path, at_once: int) -> None:
     """Count the scans that are read and not written yet."""
     counter = Counter()
     scans = counted_scans(20, counter, seconds_to_write=0.02)  # slower than the reading
@@ -707,9 +691,7 @@ def test_a_bag_in_a_folder_is_labelled_again_if_one_of_its_files_changed(tmp_pat
     assert origins[0] != origins[1]
 
 
-def test_scans_are_labelled_again_if_a_description_says_something_else_of_how_they_are_read(
-    tmp_path: Path,
-) -> None:
+def test_scans_are_labelled_again_if_the_description_reads_them_otherwise(tmp_path: Path) -> None:
     (tmp_path / "scans").mkdir()
     for number in range(2):
         street(number)[0].tofile(tmp_path / f"scans/{number}.bin")

@@ -53,9 +53,7 @@ def test_an_error_comes_in_its_turn() -> None:
     ("threads", "at_once", "scans", "each"),
     [(2, 5, 10, 1), (8, 8, 16, 1), (8, 3, 9, 2), (8, 8, 2, 4), (8, 8, 1, 8), (1, 4, 8, 1)],
 )
-def test_scans_at_the_same_time_share_the_threads(
-    threads: int, at_once: int, scans: int, each: int
-) -> None:
+def test_scans_at_once_share_the_threads(threads: int, at_once: int, scans: int, each: int) -> None:
     """With many scans each has one thread; also if there are more workers than cores."""
     before = torch.get_num_threads()
     together = min(at_once, scans)
@@ -148,9 +146,7 @@ def test_any_number_of_scans_at_a_time_gives_the_same_result(
 
 
 @pytest.mark.parametrize("command", with_full(["evaluate", "analyze", "rank", "view"], ["analyze"]))
-def test_every_command_takes_the_options_of_predict(
-    command: str, world: Path, tmp_path: Path
-) -> None:
+def test_every_command_has_predicts_options(command: str, world: Path, tmp_path: Path) -> None:
     words = [command, str(world / "data"), "--weights", str(world / "w.safetensors")]
     words += {
         "evaluate": [],

@@ -123,18 +123,14 @@ def test_lost_points_stay_in_place_and_change_nothing(method: MethodName) -> Non
 @pytest.mark.parametrize(
     ("method", "networks"), [("rv", {"rv"}), ("bev", {"bev"}), ("ensemble", {"rv", "bev"})]
 )
-def test_only_the_networks_that_were_asked_have_scores(
-    method: MethodName, networks: set[str]
-) -> None:
+def test_only_the_networks_asked_for_have_scores(method: MethodName, networks: set[str]) -> None:
     result = amvnet.load(WEIGHTS, method=method)(POINTS)
     assert (result.rv is not None) == ("rv" in networks)
     assert (result.bev is not None) == ("bev" in networks)
 
 
 @pytest.mark.parametrize("far", [1e20, 3e38, -1e30])
-def test_one_absurd_point_changes_nothing_for_the_others(
-    segmenter: Segmenter, result: Segmentation, far: float
-) -> None:
+def test_absurd_points_stay_alone(segmenter: Segmenter, result: Segmentation, far: float) -> None:
     points = np.concatenate([POINTS, [[far, 1, 1, 0.5]]]).astype(np.float32)
     actual = segmenter(points)
     assert np.array_equal(actual.scores[:-1], result.scores)
@@ -449,9 +445,7 @@ def test_rows_of_other_weights_are_refused() -> None:
 @pytest.mark.parametrize(
     "points", [POINTS, with_lost_returns(POINTS)[0]], ids=["whole", "with lost points"]
 )
-def test_fusing_the_networks_scores_gives_the_segmenters_labels(
-    segmenter: Segmenter, points: np.ndarray
-) -> None:
+def test_fused_scores_give_the_segmenters_labels(segmenter: Segmenter, points: np.ndarray) -> None:
     expected = segmenter(points)
     rv, bev = both_networks(expected)
     head = segmenter.model.point_head

@@ -110,9 +110,7 @@ def test_one_network_is_judged_by_its_mean_entropy(method: Any) -> None:
 @pytest.mark.parametrize(
     ("method", "real", "changed"), [("rv", 0.20, 0.40), ("rv-knn", 0.20, 0.40), ("bev", 0.27, 0.35)]
 )
-def test_one_network_is_trusted_on_real_scans_only(
-    method: str, real: float, changed: float
-) -> None:
+def test_one_network_is_trusted_on_real_scans(method: str, real: float, changed: float) -> None:
     """The largest entropy of a real scan, and the smallest of most changed ones (docs/log.md)."""
     assert not Verdict.of(method, real, 0.9).is_doubtful
     assert Verdict.of(method, changed, 0.9).is_doubtful

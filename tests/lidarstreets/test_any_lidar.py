@@ -175,8 +175,6 @@ def test_a_known_sensor_is_simulated_at_another_height() -> None:
         ({"beams": 300, "fov_up": 2, "fov_down": -2, "height": 1}, ["at most 256", "300"]),
     ],
 )
-def test_a_sensor_that_cannot_be_simulated_is_refused(
-    attributes: dict[str, float], words: list[str]
-) -> None:
+def test_an_impossible_sensor_is_refused(attributes: dict[str, float], words: list[str]) -> None:
     call: Callable[[], object] = lambda: simulated_lidar(make_sensor(attributes))  # noqa: E731
     fails(call, *words)

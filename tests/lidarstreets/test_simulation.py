@@ -116,9 +116,7 @@ def test_values_are_in_range(scans: list[SimulatedScan]) -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", LIDAR_MODELS)
-def test_without_motion_every_point_lies_on_its_beam_within_the_sensors_ranges(
-    name: str, seed: int
-) -> None:
+def test_without_motion_points_lie_on_their_beams_within_the_ranges(name: str, seed: int) -> None:
     """A rotation that takes no time leaves nothing to correct."""
     pytest.importorskip("embreex")
     sensor = exact_device(replace(LIDAR_MODELS[name], rotation_period=0.0, range_error=0.0))

@@ -79,9 +79,7 @@ def test_two_processes_write_the_same_bytes_as_one(real_nuscenes: Path, tmp_path
     assert digests(again) == digests(real_nuscenes)
 
 
-def test_a_stopped_simulation_continues_to_the_same_bytes(
-    nuscenes: Path, quick: None, tmp_path: Path
-) -> None:
+def test_a_stopped_simulation_ends_the_same(nuscenes: Path, quick: None, tmp_path: Path) -> None:
     def stop_after_four_scans(done: int, total: int) -> None:
         if done == 4:
             raise KeyboardInterrupt
@@ -175,9 +173,7 @@ def is_running(process: Path) -> bool:
     return stat.rsplit(")", 1)[1].split()[0] != "Z"
 
 
-def test_a_complete_simulation_is_not_written_again(
-    nuscenes: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_complete_simulation_is_kept(nuscenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(writing, "drive_street", lambda *_: pytest.fail("simulated again"))
     before = digests(nuscenes)
     simulate(nuscenes, **SETTINGS)

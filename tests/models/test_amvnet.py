@@ -121,9 +121,7 @@ def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(
             assert distances[index] == distances[as_near]
 
 
-def test_among_equally_near_points_the_choice_does_not_depend_on_the_library(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_no_library_chooses_among_equally_near_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else labels would: real scans hold many points twice."""
     places = torch.randn(100, 4, generator=torch.Generator().manual_seed(0))
     points = places[torch.arange(300) % 100]  # with 15 neighbours, the last is one of several
@@ -269,9 +267,7 @@ def test_disputed_points_equal_a_loop_over_the_uncertain_ones() -> None:
     assert not disputed_points(f, g, nothing, 2.0).any()
 
 
-def test_the_head_classifies_only_disputed_points_and_uncertain_ones_stay(
-    random_scan: RandomScan,
-) -> None:
+def test_the_head_gets_disputed_points_and_uncertain_stay(random_scan: RandomScan) -> None:
     model = whole_model()
     batch = PointBatch.of([random_scan(40), random_scan(30)])
     paper = model(batch)
@@ -343,9 +339,7 @@ def test_agreement_leaves_the_scores_alone(random_scan: RandomScan) -> None:
 
 @pytest.mark.parametrize("uncertain", [0, 1, 2500])
 @pytest.mark.parametrize("folded", [False, True])
-def test_scoring_points_from_the_table_equals_scoring_their_features(
-    uncertain: int, folded: bool
-) -> None:
+def test_scores_from_the_table_are_those_of_features(uncertain: int, folded: bool) -> None:
     head = trained_head(PointHeadConfig(), 19)
     if folded:
         freeze(head)
@@ -388,9 +382,7 @@ def test_a_scan_of_many_uncertain_points_is_classified_by_sectors_with_the_same_
 
 
 @pytest.mark.parametrize("brightest", [0, 1, 5])
-def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(
-    random_scan: RandomScan, brightest: int
-) -> None:
+def test_uncertain_points_alone_get_the_head(random_scan: RandomScan, brightest: int) -> None:
     batch = PointBatch.of([random_scan(30)])
     intensity = batch.points[:, 3].sort(descending=True).values
     model = whole_model(dull=intensity[brightest].item())
@@ -406,9 +398,7 @@ def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(
         torch.testing.assert_close(scores.merged[i], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_the_networks_scores_are_those_of_each_points_pixel_and_voxel(
-    random_scan: RandomScan,
-) -> None:
+def test_scores_are_those_of_each_points_pixel_and_voxel(random_scan: RandomScan) -> None:
     model = whole_model()
     batch = PointBatch.of([random_scan(30)])
     scores = model(batch)
@@ -425,9 +415,7 @@ def test_the_networks_scores_are_those_of_each_points_pixel_and_voxel(
 
 
 @pytest.mark.parametrize("counts", [(40, 30), (40, 1), (2, 40), (40, 0, 3)])
-def test_a_batch_of_scans_equals_each_alone(
-    random_scan: RandomScan, counts: tuple[int, ...]
-) -> None:
+def test_a_batch_equals_each_scan_alone(random_scan: RandomScan, counts: tuple[int, ...]) -> None:
     model = whole_model()
     scans = [random_scan(count, seed) for seed, count in enumerate(counts)]
     batch = PointBatch.of(scans)
@@ -442,9 +430,7 @@ def test_a_batch_of_scans_equals_each_alone(
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
-def test_scans_with_fewer_points_than_neighbours_get_scores(
-    random_scan: RandomScan, count: int
-) -> None:
+def test_scans_of_fewer_points_than_neighbours_score(random_scan: RandomScan, count: int) -> None:
     scores = whole_model(dull=-1.0)(PointBatch.of([random_scan(count)]))
     assert scores.uncertain.sum() == count
     torch.testing.assert_close(scores.merged.sum(dim=1), torch.ones(count))

@@ -42,9 +42,7 @@ def test_the_gradient_of_the_weights_is_that_of_autograd(
     torch.testing.assert_close(gradient, weight.grad)
 
 
-def test_a_layer_learns_the_same_on_processors_of_both_kinds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_layer_learns_the_same_on_both_kinds_of_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
     layer = RingConv2d(6, 10, stride=(2, 2))
     gradients = []

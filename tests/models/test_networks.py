@@ -100,9 +100,7 @@ def test_a_batch_of_two_equals_each_alone_in_eval(case: Case) -> None:
 
 @pytest.mark.parametrize("columns", [8, -16])
 @pytest.mark.parametrize("name", ["range", "range with steps"])
-def test_range_net_without_gru_is_equivariant_to_a_shift_by_its_stride(
-    name: str, columns: int
-) -> None:
+def test_range_net_without_gru_is_equivariant_to_its_stride(name: str, columns: int) -> None:
     net = CASES[name].in_eval()
     image = torch.randn(1, 6, 7, 40)
     shifted = net(image).roll(columns, 3)
@@ -250,9 +248,7 @@ def test_the_paper_size_polar_net_is_that_of_its_authors(recipe: str) -> None:
     ("recipe", "weights"),
     [("simulated-compact", "sim-hdl64e"), ("simulated-hdl32e-compact", "sim-hdl32e")],
 )
-def test_the_networks_of_the_shipped_weights_are_those_of_their_recipe(
-    recipe: str, weights: str
-) -> None:
+def test_the_networks_of_the_shipped_weights_fit_the_recipe(recipe: str, weights: str) -> None:
     expected = load_recipe(recipe).model
     model = load(weights).model
     for part in ("range_view", "polar_view", "range_net", "polar_net", "point_head"):
@@ -263,9 +259,7 @@ def test_the_networks_of_the_shipped_weights_are_those_of_their_recipe(
 @pytest.mark.parametrize(
     ("width", "left", "right"), [(5, 1, 1), (4, 0, 2), (4, 3, 0), (3, 3, 3), (1, 1, 1)]
 )
-def test_wrap_width_continues_circularly_and_has_its_gradient(
-    width: int, left: int, right: int
-) -> None:
+def test_wrap_width_is_circular_and_has_its_gradient(width: int, left: int, right: int) -> None:
     x = torch.randn(2, 2, 3, width, dtype=torch.double, requires_grad=True)
     expected = x[..., torch.arange(-left, width + right) % width]
 
@@ -321,9 +315,7 @@ def test_the_gru_has_seen_the_other_end_if_padded(share: float, seen: bool) -> N
 @pytest.mark.parametrize(
     ("height", "width", "factor"), [(5, 7, 2), (6, 8, 2), (1, 1, 2), (4, 12, 4)]
 )
-def test_upsample_gives_each_value_to_the_cells_it_stands_for(
-    height: int, width: int, factor: int
-) -> None:
+def test_upsample_gives_values_to_the_cells_they_mean(height: int, width: int, factor: int) -> None:
     coarse = torch.randn(1, 2, math.ceil(height / factor), math.ceil(width / factor))
     fine = upsample(coarse, torch.zeros(1, 9, height, width))
     assert fine.shape == (1, 2, height, width)

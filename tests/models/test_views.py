@@ -255,9 +255,7 @@ def scores_by_loop(scan: Scan, config: RangeViewConfig, scores: np.ndarray) -> n
 
 
 @pytest.mark.parametrize("nearest", [0.0, 8.0], ids=["all points", "without the car's own body"])
-def test_hidden_points_get_the_scores_of_pixels_at_their_range(
-    random_scan: RandomScan, nearest: float
-) -> None:
+def test_hidden_points_get_scores_of_their_range(random_scan: RandomScan, nearest: float) -> None:
     config = replace(SPHERICAL, width=60, hidden=2.0, nearest=nearest)
     scans = [random_scan(900, 1), random_scan(700, 2)]
     view = RangeView(config).project(PointBatch.of(scans))
@@ -358,9 +356,7 @@ def assert_polar_equals_the_loop(scan: Scan) -> None:
 
 
 @pytest.mark.parametrize(("count", "seed"), [(20_000, 0), (300, 1), (300, 2)])
-def test_polar_view_equals_a_loop_over_the_points(
-    random_scan: RandomScan, count: int, seed: int
-) -> None:
+def test_polar_view_equals_a_loop_by_point(random_scan: RandomScan, count: int, seed: int) -> None:
     assert_polar_equals_the_loop(random_scan(count, seed))
 
 
@@ -413,9 +409,7 @@ def test_pooling_by_parts_is_pooling_of_all(random_scan: RandomScan, part: int) 
     assert torch.equal(pooled, grid.pool(2 * grid.features[:, :5] - 30))
 
 
-def test_maps_hold_the_pillars_where_they_belong_and_zero_elsewhere(
-    random_scan: RandomScan,
-) -> None:
+def test_maps_hold_pillars_where_they_belong_and_zero_elsewhere(random_scan: RandomScan) -> None:
     grid = project_to_grid(random_scan(100, 1), random_scan(100, 2))
     pillars = torch.randn(len(grid.occupied), 3)
     expected = torch.zeros(2, 3, 13, 17)
@@ -482,9 +476,7 @@ def test_rings_and_rows_that_a_scan_of_a_batch_lacks_are_minus_one(random_scan: 
     assert PointBatch.of([scan]).row is None
 
 
-def test_the_views_without_the_cars_own_body_are_those_of_the_other_points(
-    random_scan: RandomScan,
-) -> None:
+def test_views_without_the_own_body_are_of_the_other_points(random_scan: RandomScan) -> None:
     scans = [random_scan(1500, 6), random_scan(900, 7)]
     others = []
     is_far = []

@@ -141,9 +141,7 @@ def test_a_scan_without_occlusion_keeps_labels_that_change_with_the_distance() -
     assert vote(batch_of(points), scores_of(flat)).argmax(dim=1).tolist() == flat
 
 
-def test_a_point_without_others_at_its_distance_keeps_its_label(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_point_alone_at_its_distance_keeps_its_label(monkeypatch: pytest.MonkeyPatch) -> None:
     far_ones = [at_pixel(4, column, 10) for column in (5, 6, 8, 9)]
     lone = at_pixel(4, 7, 12)
     f = scores_of([2, 2, 2, 2, 1])
@@ -152,9 +150,7 @@ def test_a_point_without_others_at_its_distance_keeps_its_label(
     assert vote(batch_of([*far_ones, lone]), f)[-1].argmax() == 2
 
 
-def test_of_equally_many_votes_those_with_the_least_difference_count(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_of_equal_votes_those_of_least_difference_count(monkeypatch: pytest.MonkeyPatch) -> None:
     row = [at_pixel(4, column, distance) for column, distance in ((5, 10.4), (6, 10), (7, 10.6))]
     f = scores_of([1, 3, 2])
     monkeypatch.setattr(voting, "NEIGHBOURS", 3)

@@ -24,9 +24,7 @@ def run_make(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("target", ["install", "demo"])
-def test_a_target_ends_with_the_line_that_activates_the_environment(
-    target: str, tmp_path: Path
-) -> None:
+def test_a_target_ends_with_the_line_to_activate_its_venv(target: str, tmp_path: Path) -> None:
     shutil.copy(ROOT / "Makefile", tmp_path)
     for name in ("pyproject.toml", "constraints.txt"):
         (tmp_path / name).touch()
@@ -45,9 +43,7 @@ def test_a_target_ends_with_the_line_that_activates_the_environment(
 
 
 @pytest.mark.parametrize("version", ["2.7.18", "3.10.13", None])
-def test_an_old_or_missing_python_is_refused_before_anything_is_installed(
-    version: str | None, tmp_path: Path
-) -> None:
+def test_an_old_or_no_python_is_refused_before_all(version: str | None, tmp_path: Path) -> None:
     shutil.copy(ROOT / "Makefile", tmp_path)
     for name in ("pyproject.toml", "constraints.txt"):
         (tmp_path / name).touch()

@@ -86,9 +86,7 @@ def test_every_value_arrives(through: Callable[..., Any], height: int) -> None:
     nanoseconds=st.integers(0, 10**9 - 1),
     count=st.integers(0, 20),
 )
-def test_the_origin_of_a_message_is_kept_to_the_nanosecond(
-    seconds: int, nanoseconds: int, count: int
-) -> None:
+def test_the_origin_is_kept_to_the_nanosecond(seconds: int, nanoseconds: int, count: int) -> None:
     stamp = seconds * 10**9 + nanoseconds
     message = through_ros2(Message(stamp, "os_lidar"), labelled(np.zeros(count, np.uint8)))
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (seconds, nanoseconds)

@@ -258,9 +258,7 @@ def test_clouds_have_the_quality_of_service_of_sensor_data(start: Callable[..., 
         assert profile.depth == 1
 
 
-def test_what_is_overridden_for_a_topic_does_not_change_the_others(
-    start: Callable[..., Any],
-) -> None:
+def test_what_a_topic_overrides_does_not_change_the_others(start: Callable[..., Any]) -> None:
     node = start()
     node.publishers["~/cloud"].qos.reliability = "reliable"  # as rclpy does
     _, qos = node.callbacks["points"]
@@ -456,9 +454,7 @@ def test_without_odometry_scans_are_labelled_alone_with_a_warning(
     assert "quaternions" in warnings_of(node)[0]
 
 
-def test_a_scan_without_odometry_interrupts_nothing(
-    start: Callable[..., Any], drive: Drive
-) -> None:
+def test_a_scan_without_odometry_stops_nothing(start: Callable[..., Any], drive: Drive) -> None:
     """The scans around it are fused as if it were not there."""
     node = start(odom_frame="odom", **SENSOR)
     node._frames.poses |= drive.poses
@@ -475,9 +471,7 @@ def test_a_scan_without_odometry_interrupts_nothing(
     np.testing.assert_array_equal(labels_of(node)[::2], expected)
 
 
-def test_a_bag_that_starts_again_has_the_labels_of_its_first_time(
-    start: Callable[..., Any], drive: Drive
-) -> None:
+def test_a_bag_played_twice_has_the_same_labels(start: Callable[..., Any], drive: Drive) -> None:
     node = start(odom_frame="odom", **SENSOR)
     node._frames.poses |= drive.poses
     first = label_all(node, drive.messages[:4])

@@ -37,9 +37,7 @@ def text(tag: str) -> str:
     return element.text or ""
 
 
-def test_both_manifests_agree_with_each_other_and_with_amvnet(
-    setup_arguments: dict[str, Any],
-) -> None:
+def test_both_manifests_agree_with_each_and_with_amvnet(setup_arguments: dict[str, Any]) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert text("name") == setup_arguments["name"] == "amvnet_ros"
     assert text("version") == setup_arguments["version"] == project["version"]

@@ -151,9 +151,7 @@ def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
 @pytest.mark.parametrize(
     ("stage", "launcher"), [("rv", "launch"), ("bev", "torchrun"), ("head", "srun"), ("rv", "srun")]
 )
-def test_two_processes_train_the_weights_of_one(
-    world: Path, tmp_path: Path, stage: str, launcher: str
-) -> None:
+def test_two_processes_train_as_one(world: Path, tmp_path: Path, stage: str, launcher: str) -> None:
     launchers = {"launch": output_of_launch, "torchrun": output_of_torchrun, "srun": output_of_srun}
     printed = launchers[launcher](tmp_path, *train_arguments(world, tmp_path / "two", stage))
     assert printed.count("epoch 2/") == 1  # only one of them prints
@@ -190,9 +188,7 @@ def test_processes_share_the_scans_of_evaluate(world: Path, tmp_path: Path, draw
 
 
 @pytest.mark.parametrize("command", ["train", "analyze"])
-def test_work_that_cannot_be_shared_is_refused_in_one_line(
-    world: Path, tmp_path: Path, command: str
-) -> None:
+def test_work_that_cannot_be_shared_is_refused(world: Path, tmp_path: Path, command: str) -> None:
     data = world / "data"
     arguments = {
         "train": [world / "recipe.yaml", "--data", data, "--training.rv.batch", 3],
@@ -210,9 +206,7 @@ def test_work_that_cannot_be_shared_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize(("size", "count"), [(10, 2), (11, 2), (7, 3), (2, 4)])
-def test_the_processes_parts_of_the_batches_make_up_those_of_one_process(
-    size: int, count: int
-) -> None:
+def test_the_parts_of_the_processes_make_up_those_of_one_process(size: int, count: int) -> None:
     """All processes draw equally many scans, however many there are; only the first repeat."""
     alone = list(EpochSampler(size, 3))
     parts = [list(EpochSampler(size, 3, processes=Processes(rank, count))) for rank in range(count)]

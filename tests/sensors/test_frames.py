@@ -79,9 +79,7 @@ def test_a_tilted_scan_is_levelled(tilt: tuple[float, float], axes: str) -> None
 
 @pytest.mark.parametrize("rise", first_of([1.5, 1.73, 3.4]))
 @pytest.mark.parametrize("options", [{}, {"height": 1.73}, {"offset": (0, 0, -1.73)}])
-def test_an_origin_on_the_ground_or_below_it_is_mended(
-    rise: float, options: dict[str, Any]
-) -> None:
+def test_an_origin_on_or_below_the_ground_is_mended(rise: float, options: dict[str, Any]) -> None:
     xyz = scan_xyz()
     expected, _ = normalise(xyz)
     scan, _ = normalise(xyz + np.array([0, 0, rise]), Sensor(**options))

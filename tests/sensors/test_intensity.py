@@ -95,9 +95,7 @@ def test_intensities_like_those_of_the_training_stay_as_they_are() -> None:
         lambda values: values * 1e9,
     ],
 )
-def test_intensities_of_any_range_become_those_of_the_training(
-    change: Callable[[np.ndarray], np.ndarray],
-) -> None:
+def test_all_intensities_become_the_trainings(change: Callable[[np.ndarray], np.ndarray]) -> None:
     points = scan_points()
     (scan,), _ = normalise([Cloud(points[:, :3], change(points[:, 3]), name="a")])
     intensity = scan.points[:, 3]
@@ -154,9 +152,7 @@ def test_few_missing_intensities_are_judged_without_lost_returns() -> None:
 
 @pytest.mark.parametrize("intensity", [None, 0.0, 0.15, 255, np.nan])
 @pytest.mark.parametrize("is_optional", [False, True])
-def test_missing_intensities_are_filled_in_as_the_weights_need_it(
-    intensity: float | None, is_optional: bool
-) -> None:
+def test_missing_intensities_suit_the_weights(intensity: float | None, is_optional: bool) -> None:
     xyz = scan_points()[:, :3]
     values = None if intensity is None else np.full(len(xyz), intensity)
 
@@ -219,9 +215,7 @@ def measured_intensity(data: SemanticKitti, sequences: Sequence[str]) -> Trained
     return expectation_of(scans, weights, Recipe(), ("rv", "bev")).intensity
 
 
-def test_scans_without_intensities_have_quantiles_of_zero_and_equal_ones_are_left_out(
-    tmp_path: Path,
-) -> None:
+def test_scans_without_intensities_have_zeros_and_equal_ones_are_left_out(tmp_path: Path) -> None:
     none = TrainedIntensity((0.0,) * len(PROBABILITIES))
     for level, expected in ((0.0, none), (0.5, None)):
         root = tmp_path / f"{level}"

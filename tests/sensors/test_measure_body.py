@@ -77,9 +77,7 @@ def test_the_box_of_the_body_is_measured_and_its_share_of_the_points() -> None:
         (lambda xyz: np.add(xyz, (1, 0, HEIGHT)), {"offset": (-1, 0, -HEIGHT)}),
     ],
 )
-def test_the_box_is_in_metres_and_in_the_axes_of_the_file(
-    change: Any, sensor: dict[str, Any]
-) -> None:
+def test_the_box_is_in_metres_and_the_files_axes(change: Any, sensor: dict[str, Any]) -> None:
     scans = drive()
     body = found([change(xyz) for xyz in scans], **sensor)
     assert body is not None
@@ -124,9 +122,7 @@ def test_broken_scans_are_left_out() -> None:
     assert measure_body([*reads[:3], fail, *reads[4:]], Sensor()) is not None
 
 
-def test_check_says_what_to_state_and_then_no_more(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_says_what_to_state_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for index, xyz in enumerate(drive()):
         columns = dict(zip("xyz", xyz.T, strict=True))
         np.savez(tmp_path / f"{index}.npz", **columns, label=xyz[:, 2] > -1)

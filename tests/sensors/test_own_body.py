@@ -54,9 +54,7 @@ def test_the_body_is_known_in_every_unit() -> None:
 
 
 @pytest.mark.parametrize(("share", "sensor"), [(0.1, "hdl32e"), (0.2, "os1-64"), (0.2, "vlp16")])
-def test_near_points_are_of_the_body_only_with_its_lasers_and_if_many(
-    share: float, sensor: str
-) -> None:
+def test_near_points_are_the_bodys_if_many_and_of_its_lasers(share: float, sensor: str) -> None:
     points, laser = on_nuscenes_car(share, sensor)
     points[::8, :3] = 0  # lost returns are of no body
     assert own_points(points, laser, Sensor()) is None
@@ -118,9 +116,7 @@ def test_the_networks_do_not_see_the_body() -> None:
     assert len(result.points) == len(points)
 
 
-def test_predict_says_how_many_points_are_of_the_body(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_predict_counts_own_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points, laser = on_nuscenes_car()
     path = tmp_path / "scan.npy"
     np.save(path, np.column_stack([points, laser]))

@@ -166,9 +166,7 @@ def test_a_given_height_counts_whatever_the_ground_says() -> None:
 
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("turn", first_of([(30, 10, -5), (0, 0, 0), (90, 0, 0)]))
-def test_any_frame_that_is_described_gives_the_same_scan(
-    axes: str, turn: tuple[float, float, float]
-) -> None:
+def test_any_described_frame_gives_one_scan(axes: str, turn: tuple[float, float, float]) -> None:
     points, _ = place(LASERS["os1-64"], 1.2)
     points[5] = 0
     level, _ = make_recording()
@@ -355,9 +353,7 @@ def test_recordings_that_are_only_looked_at_share_a_line_if_they_are_alike() -> 
         (Sensor(), []),
     ],
 )
-def test_a_sensor_that_is_stated_and_contradicts_the_scan_is_named(
-    stated: Sensor, words: list[str]
-) -> None:
+def test_a_sensor_that_contradicts_the_scan_is_named(stated: Sensor, words: list[str]) -> None:
     lines: list[str] = []
     normaliser = Normaliser(Expectation.of_sensor("hdl64e"), stated, lines.append)
     points, ring = place(LASERS["vlp32c"], 1.75)
@@ -371,9 +367,7 @@ def test_a_sensor_that_is_stated_and_contradicts_the_scan_is_named(
 @pytest.mark.parametrize(
     ("laser", "advice"), [("hdl32e", "sim-hdl32e would fit"), ("vlp16", "sim-any would fit")]
 )
-def test_a_warning_about_another_sensor_names_built_in_weights_that_fit(
-    laser: str, advice: str
-) -> None:
+def test_a_warning_of_another_sensor_names_weights_that_fit(laser: str, advice: str) -> None:
     recording, lines = make_recording()
     points, _ = place(LASERS[laser], 1.7)
     recording.to_scan(make_cloud(points))
@@ -540,9 +534,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("weights", ["w", "ring"])
-def test_labels_stand_at_the_lines_of_their_points(
-    world: Path, tmp_path: Path, weights: str
-) -> None:
+def test_labels_are_at_the_lines_of_their_points(world: Path, tmp_path: Path, weights: str) -> None:
     points, _ = place(LASERS["vlp16"], 0.9)
     is_lost = np.random.default_rng(0).random(len(points)) < 0.2
     points[is_lost] = 0

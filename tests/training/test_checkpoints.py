@@ -114,9 +114,7 @@ def test_a_run_that_cannot_begin_leaves_no_folder(world: Path, tmp_path: Path) -
 
 
 @pytest.mark.full
-def test_resume_removes_what_killed_runs_have_left_half_written(
-    world: Path, tmp_path: Path
-) -> None:
+def test_resume_removes_what_killed_runs_left_half_written(world: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     shutil.copytree(world / "run", out)
     part = f".{32 * '0'}.part"  # begins the names that `atomic_write` gives

@@ -97,9 +97,7 @@ def test_points_keep_their_dataset_as_their_source_when_scans_are_mixed(tmp_path
     assert set(zip(labels.tolist(), source.tolist(), strict=True)) == {(3, 0), (9, 1)}
 
 
-def test_the_check_finds_the_classes_that_only_other_datasets_have(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_check_finds_others_classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_streets(tmp_path / "a", ("00", "08"), 4)
     for path in (tmp_path / "a").rglob("*.label"):
         raw = np.fromfile(path, np.uint32)
@@ -151,9 +149,7 @@ def test_streets_are_not_taken_to_lack_the_classes_of_later_epochs(
     assert taught[0, SEMANTICKITTI.classes.index("pole")]
 
 
-def test_scans_that_are_mixed_into_others_are_of_the_same_epoch(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mixed_scans_are_of_the_same_epoch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     epochs = []
     at_epoch = SemanticKitti.at_epoch
 
@@ -254,9 +250,7 @@ def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) ->
 
 
 @pytest.mark.full
-def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought_to(
-    tmp_path: Path,
-) -> None:
+def test_weights_of_two_own_datasets_carry_what_scans_were_brought_to(tmp_path: Path) -> None:
     paths = [make_own_scans(tmp_path / name) for name in "ab"]
     weights = fresh_weights(open_own(paths[0]).taxonomy)
     own = [normalised(open_dataset(str(path)), Normaliser(weights.expects)) for path in paths]
@@ -327,9 +321,7 @@ def test_a_training_distils_what_one_of_its_datasets_lacks_and_says_so(
 
 
 @pytest.mark.full
-def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
-    world: Path, tmp_path: Path
-) -> None:
+def test_fine_tuning_keeps_the_sizes_and_can_be_repeated(world: Path, tmp_path: Path) -> None:
     # Without the broken sequence, so that all have labels.
     make_streets(tmp_path / "b", ("00",), 3)
     command = arguments(world, tmp_path / "run", str(tmp_path / "b"))

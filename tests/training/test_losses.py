@@ -133,9 +133,7 @@ def test_a_loss_is_cross_entropy_plus_the_weighted_region_loss(region_loss: Regi
 
 
 @LOSSES
-def test_the_loss_of_a_batch_is_the_mean_over_its_scans_and_so_is_its_gradient(
-    region_loss: RegionLoss,
-) -> None:
+def test_a_batchs_loss_and_gradient_are_the_means_over_its_scans(region_loss: RegionLoss) -> None:
     """One of the scans has no label, and the points of the scans are mixed."""
     logits, labels = example(points=400, classes=9)
     scan = torch.randint(0, 4, (400,), generator=torch.Generator().manual_seed(1))
@@ -198,9 +196,7 @@ def test_points_of_a_dataset_ignore_the_classes_that_it_lacks(region_loss: Regio
 
 
 @LOSSES
-def test_a_point_of_a_class_that_its_dataset_lacks_has_a_finite_loss(
-    region_loss: RegionLoss,
-) -> None:
+def test_a_point_of_a_class_its_dataset_lacks_has_finite_loss(region_loss: RegionLoss) -> None:
     """Such as a voxel that has points of two datasets."""
     logits, labels = example(points=50)
     scan = torch.zeros(50, dtype=torch.long)
@@ -320,9 +316,7 @@ def test_ignored_points_carry_no_gradient_and_the_others_do(region_loss: RegionL
 
 @LOSSES
 @pytest.mark.parametrize("points", [0, 7])
-def test_if_every_point_is_ignored_loss_and_gradient_are_zero(
-    region_loss: RegionLoss, points: int
-) -> None:
+def test_if_all_is_ignored_loss_and_gradient_are_zero(region_loss: RegionLoss, points: int) -> None:
     logits = torch.randn(points, K, requires_grad=True)
     labels = torch.zeros(points, dtype=torch.uint8)
     value = loss_of(region_loss, logits, labels, torch.ones(K), 1.0)

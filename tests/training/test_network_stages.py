@@ -110,9 +110,7 @@ def test_a_voxel_with_points_of_two_datasets_has_the_first_as_its_source() -> No
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
-def test_on_a_cpu_all_convolutions_of_a_training_step_have_channels_last(
-    stage: NetworkName,
-) -> None:
+def test_on_a_cpu_all_convolutions_of_a_step_have_channels_last(stage: NetworkName) -> None:
     config = replace(MODEL_CONFIG, range_net=replace(MODEL_CONFIG.range_net, steps=True))
     plan = plan_with(CONFIG)
     training = replace(plan.recipe.training, accelerator="cpu")
@@ -178,9 +176,7 @@ def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: NetworkNam
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
-def test_a_stage_distils_its_initial_network_where_a_dataset_lacks_a_class(
-    stage: NetworkName,
-) -> None:
+def test_a_stage_distils_its_initial_network_where_data_lack_a_class(stage: NetworkName) -> None:
     config = replace(CONFIG, distill=2.0)
     plan, model = plan_with(config), build_amvnet(MODEL_CONFIG, 19)
     assert not make_stage(plan, stage, model).teachers

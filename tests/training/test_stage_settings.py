@@ -148,9 +148,7 @@ def test_the_learning_rate_of_a_whole_run_is_one_cycle(
 
 
 @pytest.mark.parametrize(("scans", "batch", "parts"), [(5, 2, 1), (5, 2, 2), (7, 2, 3), (8, 4, 2)])
-def test_every_scan_of_a_step_has_the_same_share_of_its_gradient(
-    scans: int, batch: int, parts: int
-) -> None:
+def test_each_scan_has_the_same_share_of_the_gradient(scans: int, batch: int, parts: int) -> None:
     """Also in the last step of an epoch, which may have fewer parts, and one with fewer scans."""
     config = NetworkTraining(epochs=1, batch=batch * parts, lr=1e-3)
     view: Any = None

@@ -166,9 +166,7 @@ def test_the_class_counts_of_a_run_are_those_of_its_training_scans(world: Path, 
         assert count == np.count_nonzero(raw_labels == raw_ids.get(index, -1))
 
 
-def test_the_check_of_the_scans_reports_ten_times(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_check_reports_ten_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("amvnet.progress.QUIET_SECONDS", 0)
     dataset = open_dataset(str(make_streets(tmp_path / "data", ("00", "08"), 23)))
     data = TrainingData([Source(dataset, dataset.records(["00"]))])
@@ -235,9 +233,7 @@ def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: P
     assert recipe["training"]["rv"]["epochs"] == 1
 
 
-def test_a_decoder_with_channels_of_its_own_is_trained_and_labels(
-    world: Path, tmp_path: Path
-) -> None:
+def test_a_decoder_of_own_channels_is_trained_and_labels(world: Path, tmp_path: Path) -> None:
     options = ("--model.polar_net.decoder", "[12]", "--model.polar_net.input_norm", "true")
     weights = train(world, tmp_path / "run", "--stage", "bev", *options)
     assert weights.model.polar_net.decoder == (12,)
@@ -324,9 +320,7 @@ def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
 
 
 @pytest.mark.full
-def test_a_share_of_the_initial_weights_is_kept_and_resumes_to_the_bit(
-    world: Path, run: Path, tmp_path: Path
-) -> None:
+def test_some_initial_weights_are_kept_and_resumed(world: Path, run: Path, tmp_path: Path) -> None:
     init = run / "weights.safetensors"
     options = ("--stage", "bev", "--init", init)
     trained = train(world, tmp_path / "trained", *options).part("polar_net")
@@ -420,9 +414,7 @@ def test_tuning_weights_of_matched_intensities_matches_the_other_scans_too(
 
 
 @pytest.mark.full
-def test_reading_in_other_processes_changes_nothing_resumed_or_not(
-    world: Path, run: Path, tmp_path: Path
-) -> None:
+def test_reading_in_workers_changes_nothing_at_all(world: Path, run: Path, tmp_path: Path) -> None:
     options = ("--stage", "rv", "--training.workers", 1)
     train_interrupted("rv", 2, world, tmp_path / "run", *options)
     interrupted = load(tmp_path / "run/rv/last.safetensors")
@@ -451,9 +443,7 @@ def test_a_refused_run_leaves_the_recipe_of_the_existing_run(world: Path, run: P
     "other",
     [("--training.rv.epochs", 5), ("--model.range_net.decoder", 24), ("--training.seed", 4)],
 )
-def test_a_run_is_not_resumed_with_other_values(
-    world: Path, run: Path, other: tuple[str, object]
-) -> None:
+def test_other_values_resume_no_run(world: Path, run: Path, other: tuple[str, object]) -> None:
     names = ("recipe.yaml", "run.yaml", "weights.safetensors")
     before = {name: (run / name).read_bytes() for name in names}
     refused((*train_arguments(world, run), "--resume", *other), "stage.yaml")
@@ -468,9 +458,7 @@ def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
     refused((*train_arguments(world, tmp_path), "--stage", "rv", "--resume"), "last.ckpt")
 
 
-def test_a_broken_label_file_is_one_line_of_error_from_a_reading_process_too(
-    world: Path, tmp_path: Path
-) -> None:
+def test_a_broken_label_file_is_one_line_from_a_worker_too(world: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     shutil.copytree(world / "data", data)
     label = data / "sequences/00/labels/000001.label"
@@ -495,9 +483,7 @@ def test_resuming_a_finished_run_changes_nothing(world: Path, run: Path, tmp_pat
 
 
 @pytest.mark.full
-def test_a_finished_stage_without_its_checkpoint_is_not_trained_again(
-    world: Path, run: Path, tmp_path: Path
-) -> None:
+def test_a_finished_stage_needs_no_checkpoint(world: Path, run: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     shutil.copytree(run, out)
     for stage in PART_OF:
@@ -508,9 +494,7 @@ def test_a_finished_stage_without_its_checkpoint_is_not_trained_again(
     assert not differing(train(world, out, "--resume"), load(run))
 
 
-def test_the_head_stage_leaves_the_networks_bitwise_unchanged(
-    world: Path, run: Path, tmp_path: Path
-) -> None:
+def test_the_head_stage_keeps_the_networks_bits(world: Path, run: Path, tmp_path: Path) -> None:
     before = load(run)
     after = train(world, tmp_path / "head", "--stage", "head", "--init", run, "--training.seed", 5)
     assert differing(before, after) == {"point_head"}
@@ -755,9 +739,7 @@ def train_with_signal(
 
 @pytest.mark.full
 @STAGES
-def test_a_killed_run_resumes_to_the_same_weights(
-    world: Path, run: Path, tmp_path: Path, stage: str
-) -> None:
+def test_a_killed_run_resumes_exactly(world: Path, run: Path, tmp_path: Path, stage: str) -> None:
     out = tmp_path / "run"
     if stage == "head":
         for earlier in ("rv", "bev"):
@@ -770,9 +752,7 @@ def test_a_killed_run_resumes_to_the_same_weights(
 
 
 @pytest.mark.full
-def test_sigterm_ends_a_training_with_143_and_one_line_and_resume_goes_on(
-    world: Path, run: Path, tmp_path: Path
-) -> None:
+def test_sigterm_is_143_and_one_line_until_resumed(world: Path, run: Path, tmp_path: Path) -> None:
     """Lightning has a handler of its own, under which the training would end as if it were done."""
     code, printed = train_with_signal(world, tmp_path / "run", "rv", signal.SIGTERM)
     assert code == 143, printed.text
@@ -804,9 +784,7 @@ def test_the_handler_of_sigterm_during_a_training_is_that_of_the_process(
 
 @pytest.mark.full
 @pytest.mark.parametrize("room", [pytest.param(1_000, marks=pytest.mark.full), 40_000])
-def test_a_full_disk_stops_with_one_line_and_the_last_good_weights(
-    world: Path, tmp_path: Path, room: int
-) -> None:
+def test_a_full_disk_is_one_line_and_keeps_weights(world: Path, tmp_path: Path, room: int) -> None:
     """No file may exceed `room` bytes, which is what a full disk looks like to a program."""
     out = tmp_path / "run"
     train_interrupted("rv", 1, world, out, "--stage", "rv")
@@ -825,9 +803,7 @@ def test_a_full_disk_stops_with_one_line_and_the_last_good_weights(
 
 
 @pytest.mark.full
-def test_a_run_that_fails_prints_one_line_and_keeps_the_stages_before(
-    world: Path, tmp_path: Path
-) -> None:
+def test_a_run_that_fails_is_one_line_and_keeps_its_stages(world: Path, tmp_path: Path) -> None:
     """The notes of libraries stay out of stderr, which only a process of its own shows."""
     data = tmp_path / "data"
     shutil.copytree(world / "data", data)
@@ -887,9 +863,7 @@ def test_a_step_that_does_not_fit_into_the_memory_says_what_to_set(
     assert "--training.rv.accumulate" in error
 
 
-def test_the_share_of_uncertain_points_is_that_of_the_networks(
-    world: Path, run: Path, tmp_path: Path
-) -> None:
+def test_the_uncertain_share_is_the_networks_own(world: Path, run: Path, tmp_path: Path) -> None:
     results = tmp_path / "metrics.json"
     assert run_cli("evaluate", world / "data", "--weights", run, "--json", results) == (0, "")
     share = json.loads(results.read_text())["uncertain_fraction"]

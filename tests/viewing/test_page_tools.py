@@ -84,9 +84,7 @@ def test_corrected_labels_are_saved_in_the_form_of_their_place(
     assert state["drawn"][PERSON] == in_box(page).sum()
 
 
-def test_a_download_is_named_by_its_place_in_the_dataset(
-    page: Path, tmp_path: Path, browser: Browser
-) -> None:
+def test_a_download_is_named_as_in_its_data(page: Path, tmp_path: Path, browser: Browser) -> None:
     script = f"editor.apply({PERSON}); saveFile = (blob, name) => {{ document.title = name; }};"
     script += "editor.save(); document.title += byId('edited').textContent"
     state = browser.state(with_script(page, tmp_path / "p.html", script))
@@ -142,9 +140,7 @@ def test_the_tape_measures_metres(page: Path, tmp_path: Path, browser: Browser) 
     assert f"{expected:.2f} m" in state["dom"].texts["length"]
 
 
-def test_a_picture_and_the_table_cause_no_error(
-    page: Path, tmp_path: Path, browser: Browser
-) -> None:
+def test_pictures_and_tables_cause_no_error(page: Path, tmp_path: Path, browser: Browser) -> None:
     script = "savePicture(); byId('show-table').click()"
     state = browser.state(with_script(page, tmp_path / "p.html", script))
 

@@ -98,9 +98,7 @@ def test_every_scan_is_in_the_page_as_it_is(path: Path, dataset: SemanticKitti) 
         np.testing.assert_array_equal(planes["truth"], scan.labels)
 
 
-def test_the_page_has_the_labels_of_every_method(
-    world: Path, path: Path, dataset: SemanticKitti
-) -> None:
+def test_the_page_has_all_methods_labels(world: Path, path: Path, dataset: SemanticKitti) -> None:
     page = read_page(path)
     segmenter = amvnet.load(world / "w.safetensors")
     for index, record in enumerate(dataset.records(dataset.sequences("all"))):
@@ -112,9 +110,7 @@ def test_the_page_has_the_labels_of_every_method(
         np.testing.assert_array_equal(planes["uncertain"], uncertain)
 
 
-def test_the_page_has_the_probabilities_of_every_method(
-    world: Path, path: Path, dataset: SemanticKitti
-) -> None:
+def test_the_page_has_every_probability(world: Path, path: Path, dataset: SemanticKitti) -> None:
     segmentation = amvnet.load(world / "w.safetensors")(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
     bev = segmentation.bev
@@ -164,9 +160,7 @@ def test_the_table_of_the_page_is_that_of_evaluate(world: Path, path: Path, tmp_
             assert value == (None if iou is None else pytest.approx(100 * iou, abs=0.06))
 
 
-def test_disagreement_is_one_minus_the_cosine(
-    world: Path, path: Path, dataset: SemanticKitti
-) -> None:
+def test_disagreement_is_one_minus_cosine(world: Path, path: Path, dataset: SemanticKitti) -> None:
     segmenter = amvnet.load(world / "w.safetensors")
     segmentation = segmenter(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
@@ -356,9 +350,7 @@ def test_labels_are_read_with_the_classes_that_are_named(world: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("kind", with_full(["label", "npy", "csv", "ply"], ["label", "npy"]))
-def test_labels_of_every_format_of_predict_are_shown(
-    world: Path, tmp_path: Path, kind: str
-) -> None:
+def test_labels_of_all_formats_of_predict_are_shown(world: Path, tmp_path: Path, kind: str) -> None:
     scan = world / "lone.bin"
     weights = ("--weights", world / "w.safetensors", "--out", tmp_path / "labels")
     assert run_cli("predict", scan, *weights, "--format", kind)[0] == 0

@@ -10,9 +10,7 @@ import pytest
 from fixtures.pages import load_script
 
 
-def test_two_builds_at_once_use_the_folder_of_the_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_builds_share_the_first_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     build = load_script("web/build.py")
     monkeypatch.setattr(build, "CACHE", tmp_path / "cache")
     source = tmp_path / "source"

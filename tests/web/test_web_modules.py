@@ -655,9 +655,7 @@ def test_the_views_equal_those_of_the_onnx_runner(name: str, made: Callable[[str
 
 
 @pytest.mark.parametrize("name", WITH_VIEWS)
-def test_the_scores_of_points_equal_those_of_the_onnx_runner(
-    name: str, made: Callable[[str], Made]
-) -> None:
+def test_scores_of_points_equal_the_onnx_runners(name: str, made: Callable[[str], Made]) -> None:
     case, page = made(name)
     view = case.expected.view
     points = page["points"].reshape(-1, 4)
@@ -672,9 +670,7 @@ def test_the_scores_of_points_equal_those_of_the_onnx_runner(
 
 
 @pytest.mark.parametrize("name", ["higher_with_lost_returns", "coincident"])
-def test_neighbours_are_as_near_as_those_of_the_package(
-    name: str, made: Callable[[str], Made]
-) -> None:
+def test_neighbours_are_as_near_as_the_packages(name: str, made: Callable[[str], Made]) -> None:
     _, page = made(name)
     xyz = page["points"].reshape(-1, 4)[:, :3]
     own = np.arange(0, min(30_000, len(xyz)), 97)

@@ -283,9 +283,7 @@ def check_labels(result: dict[str, Any], expected: np.ndarray) -> None:
     assert (ids == expected).mean() >= AGREEMENT
 
 
-def test_own_weights_beside_the_page_label_as_the_onnx_runner(
-    session: Session, folder: Path
-) -> None:
+def test_own_weights_by_the_page_label_as_the_onnx_runner(session: Session, folder: Path) -> None:
     expected, _ = reference(session.files["own"], own_weights(folder), folder / "try" / OWN)
     check_labels(session.results["own"], expected)
 
@@ -376,9 +374,7 @@ def test_the_page_is_small(session: Session) -> None:
     assert session.report["memory"] < 1000 * MEGABYTE
 
 
-def test_without_isolation_one_thread_labels_a_scan(
-    plain: dict[str, Any], session: Session
-) -> None:
+def test_without_isolation_a_thread_labels_scans(plain: dict[str, Any], session: Session) -> None:
     result, _ = plain["results"]
     assert plain["isolated"] is False
     assert "one thread" in result["line"]

@@ -87,9 +87,7 @@ def test_the_description_can_be_read_without_this_package(weights: Weights, path
     assert description["metrics"] == weights.metrics
 
 
-def test_parameters_of_half_precision_hardly_change_the_scores(
-    weights: Weights, tmp_path: Path
-) -> None:
+def test_float16_parameters_hardly_change_the_scores(weights: Weights, tmp_path: Path) -> None:
     tensors = {}
     for name, tensor in weights.tensors.items():
         tensors[name] = tensor.half() if tensor.ndim > 1 else tensor
@@ -139,9 +137,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_a_file_that_is_not_weights_is_refused_in_one_line(
-    kind: str, path: Path, tmp_path: Path
-) -> None:
+def test_a_file_that_is_no_weights_is_one_line(kind: str, path: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.safetensors"
     BROKEN[kind](broken, path.read_bytes())
     with pytest.raises(InputError) as error:

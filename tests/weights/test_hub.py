@@ -190,9 +190,7 @@ def test_a_push_that_fails_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch
     fails(lambda: amvnet.push(WEIGHTS, NAME), "no way in", "hf auth login")
 
 
-def test_without_the_client_the_message_says_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_the_client_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     fails(lambda: load(NAME), 'pip install "amvnet[hub]"')
     fails(lambda: amvnet.push(WEIGHTS, NAME), 'pip install "amvnet[hub]"')

@@ -31,9 +31,7 @@ def scores(weights: Weights, method: MethodName = "amvnet") -> np.ndarray:
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_brings_its_metrics_and_the_record_of_its_training(
-    weights: Weights, part: str
-) -> None:
+def test_a_part_brings_its_metrics_and_its_training_record(weights: Weights, part: str) -> None:
     mine = {name: {"val/miou": 0.1} for name in PARTS}
     theirs = {name: {"val/miou": 0.9} for name in PARTS}
     other = replace(fresh_weights(seed=1), metrics=theirs)

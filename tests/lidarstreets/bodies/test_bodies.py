@@ -67,9 +67,7 @@ MAKERS: dict[str, tuple[Maker, set[Label]]] = {
 
 @pytest.mark.parametrize("seeds", first_of((4, 20)))
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_body_is_finite_stands_on_the_ground_and_has_labels_of_its_kind(
-    name: str, seeds: int
-) -> None:
+def test_a_body_is_finite_on_the_ground_and_has_labels_of_its_kind(name: str, seeds: int) -> None:
     pytest.importorskip("trimesh")
     make, labels = MAKERS[name]
     for seed in range(seeds):

@@ -308,9 +308,7 @@ def test_a_hull_is_closed_and_faces_outwards() -> None:
 
 @pytest.mark.parametrize("counter_clockwise", first_of((True, False)))
 @pytest.mark.parametrize("corrected", [True, False])
-def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(
-    corrected: bool, counter_clockwise: bool
-) -> None:
+def test_motion_smears_a_scan_if_not_corrected(corrected: bool, counter_clockwise: bool) -> None:
     """A rotation is centred on ahead: the sensor looks left a quarter of it later, or earlier."""
     sensor = replace(
         EXACT, rotation_period=0.1, motion_corrected=corrected, counter_clockwise=counter_clockwise
