@@ -123,9 +123,10 @@ def test_records_write_nothing_elsewhere(name: str, link: str, layout: str) -> N
         dataset = open_dataset(f"{layout}:{base}/data")
         first = dataset.records(dataset.sequences("all"))[0]
         record = replace(first, prediction=name.replace("BASE", str(base)))
-        ids = np.ones(len(dataset.read(record)), np.uint8)
+        scan = dataset.read(record)
+        ids = np.ones(len(scan), np.uint8)
         with suppress(InputError):
-            dataset.write_prediction(record, base / "out", ids)
+            dataset.write_labels(record, base / "out", scan, ids)
 
 
 ENDINGS = st.sampled_from(["label", "npy", "ply", "npz", "uncertain.npy"])
@@ -288,8 +289,9 @@ def make_hostile(folder: Path) -> None:
     set_token(folder / "nuscenes", "%2e%2e%2f..x $(id) </script>".replace("/", ""))
     nuscenes = open_dataset(f"nuscenes:{folder / 'nuscenes'}")
     for record in nuscenes.records(nuscenes.sequences("all")):
-        ids = np.ones(len(nuscenes.read(record)), np.uint8)
-        nuscenes.write_prediction(record, folder / "predictions", ids)
+        scan = nuscenes.read(record)
+        ids = np.ones(len(scan), np.uint8)
+        nuscenes.write_labels(record, folder / "predictions", scan, ids)
     (folder / "temporary").mkdir()
 
 

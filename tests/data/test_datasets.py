@@ -83,7 +83,7 @@ def test_predictions_round_trip(layout: Layout, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     ids = np.arange(1, 8)
 
-    path = dataset.write_prediction(record, folder, ids)
+    path = dataset.write_labels(record, folder, dataset.read(record), ids)
     assert path == folder / record.prediction
     assert list(path.parent.iterdir()) == [path]  # no temporary file is left
     assert path.stat().st_size == 7 * (4 if dataset.taxonomy.name == "semantickitti" else 1)
@@ -98,9 +98,10 @@ def test_ids_that_do_not_fit_are_not_written(layout: Layout, tmp_path: Path) -> 
     record = first_record(dataset, layout)
     too_few = np.ones(6)
     too_large = np.full(7, 20)
+    write = partial(dataset.write_labels, record, tmp_path, dataset.read(record))
 
-    fails(lambda: dataset.write_prediction(record, tmp_path, too_few), record.path, 7)
-    fails(lambda: dataset.write_prediction(record, tmp_path, too_large), "20")
+    fails(lambda: write(too_few), record.path, 7)
+    fails(lambda: write(too_large), "20")
     assert not (tmp_path / record.prediction).exists()
 
 
@@ -174,15 +175,15 @@ def test_a_name_without_an_ending_is_of_the_yaml_file(tmp_path: Path, has_folder
 def test_lost_returns_of_nuscenes_get_the_most_frequent_class_in_files(tmp_path: Path) -> None:
     dataset = open_dataset(make_nuscenes(tmp_path).spec)
     record = dataset.records(dataset.sequences("all"))[0]
-    count = dataset.count_points(record)
-    ids = np.full(count, 5, dtype=np.uint8)
+    scan = dataset.read(record)
+    ids = np.full(len(scan), 5, dtype=np.uint8)
     ids[:2] = [0, 3]
-    path = dataset.write_prediction(record, tmp_path, ids)
-    assert np.fromfile(path, np.uint8).tolist() == [5, 3, *[5] * (count - 2)]
+    path = dataset.write_labels(record, tmp_path, scan, ids)
+    assert np.fromfile(path, np.uint8).tolist() == [5, 3, *[5] * (len(scan) - 2)]
     assert ids[0] == 0
 
     # Other classes have an id for them.
-    dataset.write_prediction(record, tmp_path, ids, SEMANTICKITTI)
+    dataset.write_labels(record, tmp_path, scan, ids, taxonomy=SEMANTICKITTI)
     assert np.fromfile(path, np.uint8)[0] == 0
 
 

@@ -311,7 +311,7 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
     np.save(site / "a.npy", some_points())
     data = open_own(describe(tmp_path))
     (record,) = data.records(["site"])
-    path = data.write_prediction(record, tmp_path / "out", EXPECTED)
+    path = data.write_labels(record, tmp_path / "out", data.read(record), EXPECTED)
     assert path == tmp_path / "out/site/a.label"
     np.testing.assert_array_equal(np.fromfile(path, np.uint32), RAW)
     np.testing.assert_array_equal(data.read_prediction(record, tmp_path / "out"), EXPECTED)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, Normalise
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.labels.legend import read_legend
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.labels.writers import KINDS, write_scan_labels
-from amvnet.data.recordings import Recording, ScanFile, by_recording
+from amvnet.data.recordings import Normalise, Recording, ScanFile, by_recording
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.files import inside

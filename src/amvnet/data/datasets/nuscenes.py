@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, Normalise, not_trained_on
+from amvnet.data.datasets.base import Dataset, not_trained_on
 from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
 from amvnet.data.poses import Poses
-from amvnet.data.recordings import Recording, ScanFile
+from amvnet.data.recordings import Normalise, Recording, ScanFile
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError, one_line_errors, reason_of, shown
 from amvnet.files import checked_token
@@ -223,13 +223,15 @@ class NuScenes(Dataset):
         """Return the number of points of a scan, from the size of its file."""
         return count_rows(record.path, np.float32, NUSCENES_COLUMNS)
 
-    def write_prediction(
+    def write_labels(
         self,
         record: ScanFile,
         folder: Path,
+        scan: Scan,
         ids: np.ndarray,
+        *,
         taxonomy: Taxonomy | None = None,
-        count: int | None = None,
+        **files: Any,
     ) -> Path:
         """Write train ids; in the classes of nuScenes, points without one get the most frequent.
 
@@ -240,7 +242,7 @@ class NuScenes(Dataset):
         if is_for_server and is_lost.any() and not is_lost.all():
             classes, counts = np.unique(ids[~is_lost], return_counts=True)
             ids = np.where(is_lost, classes[counts.argmax()], ids)
-        return super().write_prediction(record, folder, ids, taxonomy, count)
+        return super().write_labels(record, folder, scan, ids, taxonomy=taxonomy)
 
     def _find_version(self, version: str | None) -> str:
         """Return the given version, or the only one in the folder; raise InputError if in doubt."""

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, Normalise, Split
+from amvnet.data.datasets.base import Dataset, Split
 from amvnet.data.datasets.description import SPLITS, WILDCARDS, Description, below, read_description
 from amvnet.data.formats.detect import scan_stem
 from amvnet.data.formats.find import ANY_FOLDERS, list_scans, matching
 from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.poses import Poses, read_poses, times_of
-from amvnet.data.recordings import Recording, ScanFile, by_recording
+from amvnet.data.recordings import Normalise, Recording, ScanFile, by_recording
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError, did_you_mean, readable, reason_of, shown
 from amvnet.progress import counted

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, Normalise
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.labels.ids import write_array
-from amvnet.data.recordings import Recording, ScanFile
+from amvnet.data.recordings import Normalise, Recording, ScanFile
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError, one_line_errors, shown
 from amvnet.files import temporary_folder
