@@ -16,7 +16,15 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import RangeNetConfig
 from amvnet.models import range_net
-from amvnet.models.layers import AzimuthGRU, PointLinear, RingConv2d, freeze, upsample, wrap_width
+from amvnet.models.layers import (
+    ROWS,
+    AzimuthGRU,
+    PointLinear,
+    RingConv2d,
+    freeze,
+    upsample,
+    wrap_width,
+)
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.upsampled_conv import _kernels, convolve_joined
@@ -87,6 +95,23 @@ def test_a_drive_of_scans_needs_code_for_few_numbers_of_points() -> None:
         sizes = [len(layer(torch.zeros(rows, 4))) for rows in range(0, 10_000, 100)]
     assert sizes == list(range(0, 10_000, 100))
     assert 0 < len(counts) < 10
+
+
+def test_the_rows_of_a_point_linear_layer_are_not_copied_if_they_have_code_of_their_own() -> None:
+    places = []
+
+    class Watching(TorchDispatchMode):
+        def __torch_dispatch__(
+            self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+        ) -> Any:
+            if "linear" in str(func):
+                places.append(args[0].data_ptr())
+            return func(*args, **(kwargs or {}))
+
+    x = torch.zeros(ROWS, 4)
+    with torch.inference_mode(), Watching():
+        PointLinear(4, 3)(x)
+    assert places == [x.data_ptr()]
 
 
 def test_a_batch_of_two_equals_each_alone_in_eval(case: Case) -> None:

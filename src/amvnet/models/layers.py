@@ -98,7 +98,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     needs_gradient = torch.is_grad_enabled() and (x.requires_grad or weight.requires_grad)
     if needs_gradient or not is_plain(x, weight) or not torch.backends.mkldnn.is_available():
         return F.linear(x, weight, bias)
-    padded = F.pad(x, (0, 0, 0, -len(x) % ROWS))
+    missing = -len(x) % ROWS
+    padded = F.pad(x, (0, 0, 0, missing)) if missing else x  # a pad of no rows is a copy
     outputs: Tensor = torch.ops.mkldnn._linear_pointwise(padded, weight, bias, "none", [], "")
     return outputs[: len(x)]
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from amvnet.config.schema import PointHeadConfig
-from amvnet.models.layers import PointLinear
+from amvnet.models.layers import ROWS, PointLinear
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import concatenate, occurring
@@ -18,7 +18,7 @@ from amvnet.runtime.threads import run_parts
 
 POINT_VALUES = 4  # number of a point's own values: x, y, z, intensity
 MIN_PRODUCT = 1e-24  # lower bound of f * g, so that its logarithm is finite
-PART_ON_CPU = 1024  # number of uncertain points encoded at a time on a CPU, which fit its cache
+PART_ON_CPU = ROWS  # number of uncertain points encoded at a time on a CPU, which fit its cache
 PART_ON_GPU = 2**16  # number of uncertain points encoded at a time on a GPU, which keep it busy
 POINTS_AT_ONCE = 2**17  # number of uncertain points classified at a time, which limits the memory
 
