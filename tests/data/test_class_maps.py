@@ -233,6 +233,28 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
     assert iou["building"] == pytest.approx(matrix[2] / (matrix[2] + matrix[3]))
 
 
+def test_a_point_whose_predicted_class_the_map_does_not_name_is_wrong(tmp_path: Path) -> None:
+    data = make_streets(tmp_path / "data")
+    few = write_map(tmp_path / "few.yaml", {"ground": ["road", "sidewalk"], "house": ["building"]})
+    points = wrong = 0
+    for path in (data / "sequences/08/labels").glob("*.label"):
+        raw = np.fromfile(path, np.uint32)
+        points += np.isin(raw, (40, 48, 50)).sum()
+        wrong += (raw == 48).sum()
+        raw[raw == 48] = 10  # sidewalk as cars
+        target = tmp_path / "out/sequences/08/predictions" / path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        raw.tofile(target)
+    assert wrong
+
+    figures = tmp_path / "figures.json"
+    options = ("--predictions", tmp_path / "out", "--classes", few, "--json", figures)
+    succeed("evaluate", data, *options)
+    report = json.loads(figures.read_text())["methods"]["predictions"]
+    assert report["accuracy"] == pytest.approx(1 - wrong / points)
+    assert report["iou"]["house"] == 1
+
+
 def test_classes_that_are_not_scored_are_said_with_their_share(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

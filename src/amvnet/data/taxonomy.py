@@ -48,8 +48,9 @@ class Taxonomy:
         train_to_raw: K + 1 raw ids of prediction files, indexed by train id.
         splits: official sequences of "train", "val" and "test"; empty if the dataset's reader
             defines them.
-        counts_absent: whether a class that is in neither the ground truth nor the prediction counts
-            as 0 in the mIoU (SemanticKITTI). If not, it is left out of the mIoU (nuScenes).
+        counts_absent: whether figures follow SemanticKITTI's tool: a class that is in neither the
+            ground truth nor the prediction counts as 0 in the mIoU, and a point without a predicted
+            class not in the accuracy. If not, the class is left out, and the point is wrong.
         ignores_rest: whether labels may have other raw ids; these are ignored.
 
     Raises:

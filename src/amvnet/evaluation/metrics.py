@@ -62,13 +62,13 @@ def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
     """Apply the benchmark's formulas to a confusion matrix.
 
     Points without a true class (row 0) never count. A labelled point whose predicted id is 0
-    (column 0) counts as missed for its class, but does not count in the accuracy, as in
-    SemanticKITTI's tool. nuScenes' tool does not allow such predictions.
+    (column 0) is wrong, as one whose predicted class a map does not name. SemanticKITTI's tool
+    alone leaves it out of the accuracy; nuScenes' tool does not allow such predictions.
 
     Args:
         matrix: (K + 1, K + 1) counts, truth by prediction.
-        taxonomy: the classes. Its `counts_absent` says whether a class that is neither in the truth
-            nor predicted counts in the mIoU, with an IoU of 0.
+        taxonomy: the classes. Its `counts_absent` says whether the rules of SemanticKITTI's tool
+            hold: a class that is neither in the truth nor predicted counts in the mIoU, as 0.
 
     Returns:
         Figures in [0, 1], or None where no point counts: "miou" (official), "miou_present" (the
@@ -83,7 +83,11 @@ def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
     iou = np.divide(correct, union, out=np.zeros_like(correct), where=union > 0)
 
     present = true_counts > 0
-    averaged = np.full(len(iou), True) if taxonomy.counts_absent else union > 0
+    averaged = union > 0
+    judged = true_counts
+    if taxonomy.counts_absent:
+        averaged = np.full(len(iou), True)
+        judged = predicted_counts
 
     iou_by_class: dict[str, float | None] = {}
     for index, name in enumerate(taxonomy.classes):
@@ -92,7 +96,7 @@ def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
     return {
         "miou": _ratio(iou[averaged].sum(), averaged.sum()),
         "miou_present": _ratio(iou[present].sum(), present.sum()),
-        "accuracy": _ratio(correct.sum(), predicted_counts.sum()),
+        "accuracy": _ratio(correct.sum(), judged.sum()),
         "fwiou": _ratio((true_counts * iou).sum(), true_counts.sum()),
         "iou": iou_by_class,
     }
