@@ -389,6 +389,31 @@ def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) 
     check_same(tmp_path / "out", whole)
 
 
+def test_a_run_is_not_resumed_with_a_scan_of_the_same_name_from_elsewhere(
+    world: Path, tmp_path: Path
+) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        shutil.copy(world / f"scans/00000{'ab'.index(folder)}.bin", tmp_path / folder / "x.bin")
+    options = f"--weights {world}/{WEIGHTS} --out"
+    succeed(f"predict {tmp_path}/a/x.bin {options} {tmp_path}/out")
+    before = (tmp_path / "out/x.label").stat().st_mtime_ns
+    command = f"predict {tmp_path}/b/x.bin {options} {tmp_path}/out --resume"
+    refused(command, f"{tmp_path}/b/x.bin", f"those of {tmp_path.resolve()}/a/x.bin")
+
+    # The scan itself may move. A journal of an earlier version does not know the place.
+    (tmp_path / "a").rename(tmp_path / "moved")
+    succeed(f"predict {tmp_path}/moved/x.bin {options} {tmp_path}/out --resume")
+    assert (tmp_path / "out/x.label").stat().st_mtime_ns == before
+    journal = tmp_path / "out" / JOURNAL
+    settings, entry = map(json.loads, journal.read_text().splitlines())
+    journal.write_text("".join(f"{json.dumps(line)}\n" for line in (settings, entry[:-1])))
+    succeed(f"predict {tmp_path}/moved/x.bin {options} {tmp_path}/out --resume")
+    assert (tmp_path / "out/x.label").stat().st_mtime_ns == before
+    succeed(command)
+    assert (tmp_path / "out/x.label").stat().st_mtime_ns != before
+
+
 ENTRIES = [Entry(name, "0f", "drive", 10, 3, [1]) for name in "ab"]
 
 

@@ -12,7 +12,7 @@ from amvnet.files import atomic_write, remove_unfinished
 
 JOURNAL = ".amvnet-journal.jsonl"  # the name of the journal after the run has ended
 UNFINISHED = ".unfinished.jsonl"  # the name of the journal during the run
-KINDS = [str, str, str, int, int, list, int]  # the types of the values in JSON
+KINDS = [str, str, str, int, int, list, int, str]  # the types of the values in JSON
 
 
 class Entry(NamedTuple):
@@ -25,6 +25,7 @@ class Entry(NamedTuple):
         uncertain: the number of uncertain points: `points` times `Segmentation.doubt`.
         counts: the number of points of each train id that was written, from 0.
         own: the number of points of the car's own body, which are not in `counts`.
+        place: the whole path of its file without links; empty in journals of earlier versions.
     """
 
     scan: str
@@ -34,11 +35,12 @@ class Entry(NamedTuple):
     uncertain: int
     counts: list[int]
     own: int = 0
+    place: str = ""
 
     @classmethod
     def from_json(cls, values: Any) -> Entry | None:
         """Return the entry that a line of a journal holds; None if it holds anything else."""
-        if not isinstance(values, list) or list(map(type, values)) != KINDS:
+        if not isinstance(values, list) or list(map(type, values)) not in (KINDS, KINDS[:-1]):
             return None
         entry = cls(*values)
         numbers = [entry.points, entry.uncertain, entry.own, *entry.counts]

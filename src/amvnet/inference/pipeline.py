@@ -141,8 +141,8 @@ class Pipeline:
             a line for each scan that is broken.
 
         Raises:
-            InputError: if the run that is resumed had other settings, another run is writing into
-                the folder, or `check_output` raises it.
+            InputError: if the run that is resumed had other settings or another scan of the same
+                name, another run is writing into the folder, or `check_output` raises it.
         """
         folder = self.output.folder
         with alone_in(folder):
@@ -199,9 +199,19 @@ class Pipeline:
 
         The scan has not changed, nor have the first scans of its recording and what a description
         says of them, which decide how it is normalised.
+
+        Raises:
+            InputError: if the files are those of another scan of this name.
         """
+        is_same = entry.origin == self._origins[entry.scan]
+        if not is_same and entry.place not in ("", str(scan.path.resolve())):
+            raise InputError(
+                f"{scan.path}: expected no labels of another scan of this name in "
+                f"{self.output.folder}, found those of {entry.place}; write to another folder, or "
+                "say --overwrite instead of --resume"
+            )
         paths = [self.output.folder / path for path in self.output.files.of(scan)]
-        return entry.origin == self._origins[entry.scan] and all(map(Path.is_file, paths))
+        return is_same and all(map(Path.is_file, paths))
 
     @cached_property
     def _origins(self) -> dict[str, str]:
@@ -318,6 +328,7 @@ class Pipeline:
             uncertain=round(result.doubt * points),
             counts=np.bincount(result.labels[~own]).tolist(),
             own=int(np.count_nonzero(own)),
+            place=str(scan.path.resolve()),
         )
 
 
