@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from amvnet.cli.options import LabelledChoice
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.starter import write_starter
@@ -153,6 +154,15 @@ def test_the_last_tenth_of_a_single_sequence_validates(
     assert len(val) == validating
     succeed(f"check {path}")
     assert f"no split: {validating} scan" in capsys.readouterr().out
+
+    LabelledChoice().records(dataset)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"labelled scans: {validating} scan" in printed
+    assert f"those that validate without a split; --split all takes all {count}" in printed
+    LabelledChoice(split="all").records(dataset)
+    path.write_text(f"{path.read_text()}split: {{val: ['0000']}}\n")
+    LabelledChoice().records(open_dataset(str(path)))
+    assert "without a split" not in capsys.readouterr().out
 
 
 def test_a_split_takes_patterns_with_or_without_the_ending_and_shows_a_whole_name(

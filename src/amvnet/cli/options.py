@@ -93,6 +93,10 @@ class LabelledChoice:
         text = f"labelled scans: {describe_records(records)}"
         if len(records) < len(chosen):
             text += f"; {len(chosen) - len(records)} others have no labels"
+        if (self.sequences, self.split, dataset.split().is_given) == (None, None, False):
+            every = dataset.having_labels(dataset.records(dataset.sequences("all")))
+            if len(every) > len(records):
+                text += f", those that validate without a split; --split all takes all {len(every)}"
         report(text)
         return records
 
