@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from amvnet.cli.options import LabelledChoice
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.starter import write_starter
+from amvnet.data.labels.writers import write_scan_labels
+from amvnet.data.taxonomy import SEMANTICKITTI
 
 from fixtures.commands import files, refusal, refused, succeed
 from fixtures.own_scans import SCANS, SITES, make_own_scans, own_labels, robot_scans
@@ -76,6 +79,52 @@ def test_scans_and_labels_are_told_apart_whatever_their_names(
     records = started.records(started.parts()["all"])
     paths = sorted(str(record.labels_path) for record in records)
     assert paths == [str(tmp_path / "data" / labels.format(index)) for index in range(3)]
+
+
+def test_labels_in_a_folder_beside_the_scans_are_found(tmp_path: Path) -> None:
+    for below in ("", "a/"):
+        data = make_flat(tmp_path / f"{below}x", 3, f"scans/{below}{{:04d}}.pcd")
+        make_flat(data, 3, "points/{:04d}.npy", f"labels/{below}{{:04d}}.npy")
+        (data / "photos").mkdir()
+        (data / "photos/0000.jpg").write_bytes(b"photo")
+        path, found = write_starter(data / "scans")
+        assert found.labelled == 3
+        started = open_own(path)
+        records = started.records(started.parts()["all"])
+        assert [record.labels_path for record in records] == [
+            data / "labels" / below / f"{index:04d}.npy" for index in range(3)
+        ]
+
+
+@pytest.mark.parametrize("others", [(), (252, 259)])
+def test_ids_that_usually_stand_for_no_label_are_ignored_with_their_shares(
+    tmp_path: Path, others: tuple[int, ...]
+) -> None:
+    folder = make_flat(tmp_path / "data", 3, "{:04d}.pcd", "{:04d}.npy")
+    for path in folder.glob("*.npy"):
+        labels = np.load(path)
+        labels[: len(labels) // 4] = 255
+        labels[len(labels) - len(others) :] = others
+        np.save(path, labels)
+    path, found = write_starter(folder)
+    text = path.read_text()
+    shares = {raw: f"{count / sum(found.ids.values()):.1%}" for raw, count in found.ids.items()}
+    assert (f"class_255: 255  # {shares[255]}" in text) == bool(others)
+    assert (f"255: {shares[255]}" in text.partition("# ids without a class")[2]) != bool(others)
+    assert f"-1: {shares[65535]}" in text
+    succeed(f"check {path}")
+
+
+def test_the_id_that_labels_name_as_none_is_ignored(tmp_path: Path) -> None:
+    folder = make_flat(tmp_path / "data", 2, "{:04d}.npy")
+    none = replace(SEMANTICKITTI, name="own", train_to_raw=(77, *SEMANTICKITTI.train_to_raw[1:]))
+    for path in sorted(folder.glob("*.npy")):
+        points = np.load(path)
+        ids = np.arange(len(points)) % 3
+        write_scan_labels(folder / f"{path.stem}_labels", "ply", points[:, :3], ids, none)
+    path, _ = write_starter(folder)
+    assert "ignored: [77]  # ids without a class; 77: 33.3%" in path.read_text()
+    assert "class_10: 10  # 33.3%" in path.read_text()
 
 
 def test_check_of_a_folder_writes_the_file_once_and_says_what_to_fill_in(

@@ -18,6 +18,7 @@ from amvnet.data.datasets.description import ENDINGS, REST, LabelPlace
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import scan_stem
 from amvnet.data.formats.find import list_scans
+from amvnet.data.labels.legend import read_legend
 from amvnet.data.labels.readers import COLUMNS, read_raw_labels
 from amvnet.data.recordings import evenly_spaced
 from amvnet.data.taxonomy import INSTANCE_MASK
@@ -28,7 +29,8 @@ from amvnet.progress import counted
 COUNTED_FILES = 20  # number of label files whose ids are counted
 MOST_CLASSES = 50  # largest number of ids that become classes
 # Ids that usually stand for no label, as the YAML file writes them.
-UNLABELLED: Mapping[int, int | str] = {0: 0, INSTANCE_MASK: -1}
+UNLABELLED: Mapping[int, int | str] = {0: 0, 255: 255, INSTANCE_MASK: -1}
+FIRST_MOVING = 252  # SemanticKITTI's ids of moving things, of which 255 is one
 TRIED_FILES = 3  # a group has scans if one of so many first files can be read as a scan
 
 SUFFIX = re.compile(r"[_.-][A-Za-z]+$")  # the last word of a stem, as in 0001_label
@@ -48,6 +50,7 @@ class Found:
         labels: the place of the labels; None if there are none.
         labelled: the number of scans with labels.
         ids: the number of points by raw id in some of the labels, most first.
+        unlabelled: the id that the labels themselves name as that of no class, if any.
     """
 
     scans: Sequence[Path]
@@ -56,6 +59,7 @@ class Found:
     labels: LabelPlace | None = None
     labelled: int = 0
     ids: Mapping[int, int] = field(default_factory=dict)
+    unlabelled: int = 0
 
     def lines(self) -> Iterator[str]:
         """Yield lines that say what was found."""
@@ -77,8 +81,15 @@ class Found:
     def text(self, root: str) -> str:
         """Return the YAML file, which lies beside the folder `root`."""
         total = sum(self.ids.values())
-        classes = [raw for raw in self.ids if raw not in UNLABELLED][:MOST_CLASSES]
-        ignored = [UNLABELLED.get(raw, REST) for raw in self.ids if raw not in classes]
+        unlabelled = {self.unlabelled: self.unlabelled, **UNLABELLED}
+        if any(FIRST_MOVING <= raw < INSTANCE_MASK and raw != 255 for raw in self.ids):
+            unlabelled.pop(255)
+        classes = [raw for raw in self.ids if raw not in unlabelled][:MOST_CLASSES]
+        ignored: Counter[int | str] = Counter()
+        for raw, count in self.ids.items():
+            if raw not in classes:
+                ignored[unlabelled.get(raw, REST)] += count
+        shares = ", ".join(f"{raw}: {count / total:.1%}" for raw, count in ignored.items())
         lines = [
             "# Give each class a name; one class may have several ids, as [1, 2].",
             "# docs/own_data.md explains all keys.",
@@ -91,7 +102,9 @@ class Found:
         else:
             lines += [f"labels: {_yaml(_entry(self.labels))}", "classes:"]
             lines += [f"  class_{raw}: {raw}  # {self.ids[raw] / total:.1%}" for raw in classes]
-        lines.append(f"ignored: {_yaml(list(dict.fromkeys(ignored)))}  # ids without a class")
+        lines.append(
+            f"ignored: {_yaml(list(ignored))}  # ids without a class; {shares}".rstrip("; ")
+        )
         return "\n".join([*lines, ""])
 
 
@@ -142,16 +155,17 @@ def find_labelled(folder: Path) -> Found:
     places: dict[Group, LabelPlace] = {}
     label_groups = set()  # an array of labels can also be readable as points
     for group, (scan, cloud) in readable.items():
+        count = len(cloud.xyz)
         for other, candidates in groups.items():
             if other == group:
                 continue
-            place = _place_among(candidates, scan, len(cloud.xyz))
+            place = _place_among(candidates, scan, count)
             if place is not None:
                 places[group] = place
                 label_groups.add(other)
-        inside = _place_inside(scan, len(cloud.xyz))
-        if inside is not None:
-            places.setdefault(group, inside)
+        elsewhere = _place_inside(scan, count) or _place_beside(folder, scan, count)
+        if elsewhere is not None:
+            places.setdefault(group, elsewhere)
 
     scan_groups = [group for group in readable if group not in label_groups]
     if not scan_groups:
@@ -167,7 +181,10 @@ def find_labelled(folder: Path) -> Found:
         return Found(paths, pattern, first)
 
     labelled = [path for path in paths if place.path_of(path, scan_stem(path)).is_file()]
-    return Found(paths, pattern, first, place, len(labelled), _ids_of(labelled, place))
+    legend = read_legend(place.path_of(labelled[0], scan_stem(labelled[0])))
+    unlabelled = 0 if legend is None else legend.train_to_raw[0]
+    ids = _ids_of(labelled, place)
+    return Found(paths, pattern, first, place, len(labelled), ids, unlabelled)
 
 
 def _groups_in(folder: Path) -> Mapping[Group, Sequence[Path]]:
@@ -208,6 +225,19 @@ def _place_among(paths: Sequence[Path], scan: Path, count: int) -> LabelPlace | 
         read_raw_labels(nearest, count, missing=0)
         folder = Path(os.path.relpath(nearest.parent, scan.parent))
         return LabelPlace((folder / nearest.name.replace(stem, "{name}", 1)).as_posix())
+    return None
+
+
+def _place_beside(folder: Path, scan: Path, count: int) -> LabelPlace | None:
+    """Return the place of the labels of a scan if a folder beside that of all scans holds them."""
+    below = scan.parent.relative_to(folder)
+    named = f"*{glob.escape(scan_stem(scan))}*"
+    for other in sorted(folder.parent.glob("*")):
+        paths = sorted((other / below).glob(named)) if other != folder else []
+        for path in paths:
+            place = _place_among([path], scan, count)
+            if place is not None:
+                return place
     return None
 
 
