@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 EXTRAS ?= simulate,formats,export,drives,test
+# EXTRAS that somebody gives are installed unless they were installed last.
+AGAIN := $(if $(filter file,$(origin EXTRAS)),,$(if $(filter-out $(shell cat .venv/installed 2> /dev/null),$(EXTRAS)),again))
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # Each processor runs one process with one thread. One process runs all tests of a file, because they share what they make.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
@@ -14,8 +16,12 @@ endef
 
 # Said before anything is downloaded; pip would say it after PyTorch.
 CHECK_PYTHON := import sys; sys.version_info >= (3, 11) or sys.exit("expected Python 3.11 or newer, found " + sys.version.split()[0] + "; make install PYTHON=python3.12")
+# pip would take a misspelt extra for none.
+CHECK_EXTRAS := import sys, tomllib; known = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; \
+    wrong = {*"$(EXTRAS)".replace(" ", "").split(",")} - {"", *known}; \
+    sys.exit("expected EXTRAS of " + ",".join(known) + ", found " + ",".join(sorted(wrong)) + "; make install EXTRAS=simulate,formats" if wrong else 0)
 
-.PHONY: install demo test test-full all-tests bench gpu docs style lint format release clean
+.PHONY: install demo test test-full all-tests bench gpu docs style lint format release clean again
 
 install: .venv/installed  ## the package and all that its tests need, in .venv
 	@$(NEXT)
@@ -61,15 +67,16 @@ release:  ## VERSION=1.2.3 sets and dates a version, commits and tags it; pushin
 	$(PYTHON) .ci/release.py $(VERSION)
 
 # torch is installed first and alone, with a pinned version, so that no other build of it is installed.
-.venv/installed: pyproject.toml constraints.txt
+.venv/installed: pyproject.toml constraints.txt $(AGAIN)
 	@command -v $(PYTHON) > /dev/null || { echo "expected Python 3.11 or newer, found no $(PYTHON); make install PYTHON=python3.12" >&2; exit 1; }
 	@$(PYTHON) -c '$(CHECK_PYTHON)'
+	@$(PYTHON) -c '$(CHECK_EXTRAS)'
 	@echo "installing PyTorch in .venv: a minute, or several with a slow connection"
 	@$(PYTHON) -m venv .venv
 	@$(PIP) torch
 	@echo "installing amvnet and what its tests need: a minute, or several with a slow connection"
 	@$(PIP) --editable ".[$(EXTRAS)]"
-	@touch $@
+	@echo "$(EXTRAS)" > $@
 
 # These packages take 600 MB, so `make test` does not need them.
 .venv/fleet: .venv/installed

@@ -63,3 +63,34 @@ def test_an_old_or_no_python_is_refused_before_all(version: str | None, tmp_path
     line = f"expected Python 3.11 or newer, found {found}; make install PYTHON=python3.12"
     assert done.stderr.splitlines()[0] == line
     assert not (tmp_path / ".venv").exists()
+
+
+def test_other_extras_are_installed_into_a_venv_that_exists(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    (tmp_path / "constraints.txt").touch()
+    python = tmp_path / "python"
+    python.write_text(f"""#!/bin/sh
+case "$2" in
+venv) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
+pip) echo "$@" >> pip.txt ;;
+*) exec {sys.executable} "$@" ;;
+esac
+""")
+    python.chmod(0o755)
+
+    def installed(*words: str) -> list[str]:
+        (tmp_path / "pip.txt").write_text("")
+        assert run_make(tmp_path, "install", f"PYTHON={python}", *words).returncode == 0
+        return [line.split()[-1] for line in (tmp_path / "pip.txt").read_text().splitlines()]
+
+    assert installed() == ["torch", ".[simulate,formats,export,drives,test]"]
+    assert installed() == []
+    assert installed("EXTRAS=hub,drives") == ["torch", ".[hub,drives]"]
+    assert installed("EXTRAS=hub,drives") == installed() == []
+
+    done = run_make(tmp_path, "install", f"PYTHON={python}", "EXTRAS=hub,formts")
+    assert done.returncode != 0
+    assert done.stderr.startswith("expected EXTRAS of simulate,export,")
+    assert "found formts; make install" in done.stderr.splitlines()[0]
+    assert installed("EXTRAS=hub,drives") == []
