@@ -211,7 +211,7 @@ class OnnxSegmenter:
         self, points: np.ndarray, f: np.ndarray, g: np.ndarray, disputed: np.ndarray
     ) -> np.ndarray:
         """Return (U, K) class probabilities of the disputed points by the point head."""
-        index = np.flatnonzero(disputed)
+        index, cube = first_in_cubes(points, np.flatnonzero(disputed), self.head.cell)
         near = nearest_others(points[:, :3], index, self.head.neighbours)
         table = np.concatenate([f, g, points], axis=1)
 
@@ -223,7 +223,8 @@ class OnnxSegmenter:
             rows[..., -4:] -= point[:, None, -4:]  # x, y, z, intensity relative to the point
             point[:, -4:-1] *= np.float32(self.head.position_scale)
             logits.append(self._run("point_head", point, rows))
-        return softmax(np.concatenate(logits))
+        scores: np.ndarray = softmax(np.concatenate(logits))[cube]
+        return scores
 
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
         names = [entry["name"] for entry in self.description["graphs"][name]["inputs"]]
@@ -378,6 +379,20 @@ def disputed_points(
     disputed = uncertain.copy()
     disputed[uncertain] = differs | (is_close.sum(axis=1) > 1)
     return disputed
+
+
+def first_in_cubes(
+    points: np.ndarray, index: np.ndarray, edge: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first of some points (U,) in each cube, (V,), and the place (U,) of its cube.
+
+    The cubes divide space, and have an edge in metres; with 0, each point has a cube of its own.
+    """
+    if not edge:
+        return index, np.arange(len(index))
+    cubes = np.floor(points[index, :3].astype(np.float64) / edge)
+    _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
+    return index[first], cube.reshape(-1)
 
 
 def softmax(scores: NDArray[np.float32]) -> NDArray[np.float32]:

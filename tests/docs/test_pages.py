@@ -78,10 +78,10 @@ def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().split()) <= 1100
 
 
-def test_the_page_in_the_browser_has_less_than_1750_lines_of_code() -> None:
+def test_the_page_in_the_browser_has_less_than_1800_lines_of_code() -> None:
     lines: list[str] = []
     for path in (ROOT / "web").rglob("*.js"):
         if "node_modules" not in path.parts:
             lines += path.read_text().splitlines()
     code = [line for line in lines if line.strip() and not re.match(r"\s*(//|/?\*)", line)]
-    assert len(code) < 1750
+    assert len(code) < 1800

@@ -53,9 +53,12 @@ def test_each_field_changes_the_settings() -> None:
 
 def test_weights_that_choose_other_points_for_the_head_change_the_settings() -> None:
     weights = fresh_weights()
-    assertion = replace(weights.model.assertion, lead=3.0)
-    other = replace(weights, model=replace(weights.model, assertion=assertion))
-    assert LabellingRequest(other).settings != LabellingRequest(weights).settings
+    model = weights.model
+    lead = replace(model, assertion=replace(model.assertion, lead=3.0))
+    cell = replace(model, point_head=replace(model.point_head, cell=0.1))
+    for other in (lead, cell):
+        request = LabellingRequest(replace(weights, model=other))
+        assert request.settings != LabellingRequest(weights).settings
 
 
 def test_equal_requests_have_equal_settings() -> None:

@@ -6,6 +6,7 @@ import math
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -248,6 +249,32 @@ def test_at_the_threshold_a_point_is_uncertain() -> None:
     points = torch.zeros(2, 4)
 
     assert Disagreement(0.0)(f, f.flip(0), points).all()
+
+
+@pytest.mark.parametrize("edge", [0.0, 0.1, 1.0])
+def test_points_of_a_cube_get_the_scores_of_its_first_disputed_point(edge: float) -> None:
+    f, g, points, _ = random_scores()
+    points[::50, :3] *= 100  # some are far away
+    batch = PointBatch.of([Scan(points.numpy()), Scan(points[:70].flip(0).numpy())])
+    f, g = (torch.cat([values, values[:70].flip(0)]) for values in (f, g))
+    disputed = torch.arange(270) % 3 > 0
+    model = whole_model().eval()
+    assert model.point_head is not None
+    h = model.refine(batch, f, g, disputed)
+    assert h is not None
+    every = torch.zeros_like(f)
+    every[disputed] = h
+
+    model.point_head.config = replace(TINY.point_head, cell=edge)
+    shared = model.refine(batch, f, g, disputed)
+    first: dict[tuple[int, ...], int] = {}
+    expected = []
+    for i in disputed.nonzero()[:, 0].tolist():
+        place = [math.floor(x / edge) if edge else i for x in batch.points[i, :3].tolist()]
+        expected.append(every[first.setdefault((i >= 200, *place), i)])
+    assert shared is not None
+    torch.testing.assert_close(shared, torch.stack(expected))
+    assert (len(first) < len(expected)) == (edge == 1)
 
 
 def test_disputed_points_equal_a_loop_over_the_uncertain_ones() -> None:

@@ -719,6 +719,28 @@ def test_disputed_points_are_those_of_the_onnx_runner(lead: float, tmp_path: Pat
     assert (len(expected) < np.count_nonzero(uncertain)) == (lead > 0)
 
 
+@pytest.mark.parametrize("edge", [0, 0.1, 2])
+def test_points_share_a_cube_as_in_the_onnx_runner(edge: float, tmp_path: Path) -> None:
+    points = some_points(2000)
+    index = np.arange(0, 2000, 3)
+    expected, cube = onnx_runner.first_in_cubes(points, index, edge)
+    points.astype(np.float32).tofile(tmp_path / "points")
+
+    script = f"""
+        import {{ readFileSync }} from "node:fs";
+        import {{ firstInCubes }} from {json.dumps((PAGE / "method/fusion.js").as_uri())};
+        const points = new Float32Array(new Uint8Array(readFileSync("points")).buffer);
+        const index = Uint32Array.from({json.dumps(index.tolist())});
+        const [first, cube] = firstInCubes(points, index, {edge});
+        console.log(JSON.stringify([[...first], [...cube]]));
+    """
+    assert NODE is not None
+    command = [NODE, "--input-type=module", "-e", script]
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True).stdout
+    first, place = map(np.array, json.loads(output))
+    assert np.array_equal(first[place], expected[cube])
+
+
 # The numbers of the modules as the package has them; the page's own ones are left out.
 NUMBERS: dict[str, dict[str, float]] = {
     "method/fusion.js": {"TINY": assertion.TINY},

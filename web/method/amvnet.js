@@ -1,6 +1,6 @@
 // AMVNet, step by step as in the paper: project, score twice, compare, classify the disputed points, merge.
 
-import { disputedOf, geometricMean, labelsOf, merged, similarityOf } from "./fusion.js";
+import { disputedOf, firstInCubes, geometricMean, labelsOf, merged, similarityOf } from "./fusion.js";
 import { classify } from "./head.js";
 import { nearestOthers } from "./neighbours.js";
 import { polarGrid } from "./polar_view.js";
@@ -33,10 +33,11 @@ export async function segment(networks, { points, rows }, step) {
   scores.ensemble = await step("mean of both", () => geometricMean(f, g));
 
   if (method === "amvnet") {
-    const index = disputedOf(f, g, k, uncertain, lead), n = description.point_head.neighbours;
+    const disputed = disputedOf(f, g, k, uncertain, lead), { neighbours: n, cell } = description.point_head;
+    const [index, cube] = firstInCubes(points, disputed, cell);
     const neighbours = await step("neighbours", () => (index.length ? nearestOthers(points, index, n) : index));
     const head = await step("point head", () => classify(networks, { points, f, g, disputed: index, neighbours }));
-    scores.amvnet = await step("merge", () => merged(scores.ensemble, index, head, k));
+    scores.amvnet = await step("merge", () => merged(scores.ensemble, disputed, head, cube, k));
   }
   return { scores, labels: labelsOfAll(scores, k), similarity, uncertain };
 }

@@ -30,10 +30,24 @@ export function geometricMean(f, g) {
   return f.map((value, place) => Math.sqrt(value * g[place]));
 }
 
-/** Return the mean (n K), in which the disputed points (u) have the probabilities of the head (u K). */
-export function merged(mean, disputed, head, k) {
+/**
+ * Return the first (v) of some points (u) in each cube of space, whose edge is in metres, and the place (u) of each point's cube
+ * among them. With an edge of 0, each point has a cube of its own.
+ */
+export function firstInCubes(points, index, edge) {
+  const cubes = new Map(), first = [];
+  const cube = index.map((i) => {
+    const key = edge ? [0, 1, 2].map((axis) => Math.floor(points[4 * i + axis] / edge)).join() : i;
+    if (!cubes.has(key)) cubes.set(key, first.push(i) - 1);
+    return cubes.get(key);
+  });
+  return [Uint32Array.from(first), cube];
+}
+
+/** Return the mean (n K), in which the disputed points (u) have the head's probabilities (v K) of their cube (u). */
+export function merged(mean, disputed, head, cube, k) {
   const scores = mean.slice();
-  disputed.forEach((i, row) => scores.set(head.subarray(row * k, (row + 1) * k), i * k));
+  disputed.forEach((i, row) => scores.set(head.subarray(cube[row] * k, (cube[row] + 1) * k), i * k));
   return scores;
 }
 

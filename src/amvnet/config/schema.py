@@ -229,6 +229,9 @@ class PointHeadConfig(Bounded):
     """Factor on x, y, z in metres as features, which brings them to the magnitude of the scores."""
     share: Share = 1.0
     """Weight of the head in predictions, in its geometric mean with the ensemble. Paper: 1."""
+    cell: Annotated[float, Range(0, 10)] = 0.0
+    """Edge of cubes of space, metres: the head classifies the first disputed point in each cube,
+    and the others there get its scores. 0: it classifies all of them (paper)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -68,8 +68,11 @@ class LabellingRequest:
     def settings(self) -> dict[str, Any]:
         """The request in JSON types; only a run with equal settings may be resumed."""
         weights = self.weights.digests()
-        if lead := self.weights.model.assertion.lead:  # decides labels by the same parameters
-            weights["lead"] = str(lead)
+        # These decide labels by the same parameters.
+        model = self.weights.model
+        for name, value in (("lead", model.assertion.lead), ("cell", model.point_head.cell)):
+            if value:
+                weights[name] = str(value)
         return {
             "weights": weights,
             "method": self.method,

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from amvnet.config.schema import ModelConfig
 from amvnet.models.assertion import Assertion, Disagreement, disputed_points
 from amvnet.models.methods import Ensemble, geometric_mean
-from amvnet.models.point_head import PointHead, nearest_neighbours
+from amvnet.models.point_head import PointHead, first_in_cubes, nearest_neighbours
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.views.points import PointBatch, concatenate
@@ -90,14 +90,17 @@ class LateFusion(nn.Module):
             return None
 
         # The neighbours of a point are points of its own scan.
+        config = self.point_head.config
         parts = []
         for scan in batch.slices():
             points = batch.points[scan]
-            index = disputed[scan].nonzero()[:, 0]  # (U,)
+            index = disputed[scan].nonzero()[:, 0]
             with self.watch("neighbours"):
-                near = nearest_neighbours(points, index, self.point_head.config.neighbours)
+                index, cube = first_in_cubes(points, index, config.cell)  # (V,), (U,)
+                near = nearest_neighbours(points, index, config.neighbours)
             with self.watch("head"):
-                parts.append(self.point_head.classify(points, f[scan], g[scan], index, near))
+                h = self.point_head.classify(points, f[scan], g[scan], index, near)
+                parts.append(h.index_select(0, cube))
         return concatenate(parts)
 
     def merge(self, f: Tensor, g: Tensor, disputed: Tensor, h: Tensor | None) -> Tensor:

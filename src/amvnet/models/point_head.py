@@ -18,6 +18,7 @@ from amvnet.runtime.threads import run_parts
 
 POINT_VALUES = 4  # number of a point's own values: x, y, z, intensity
 MIN_PRODUCT = 1e-24  # lower bound of f * g, so that its logarithm is finite
+CUBES = 2**21 - 1  # largest number of a cube along an axis
 PART_ON_CPU = ROWS  # number of uncertain points encoded at a time on a CPU, which fit its cache
 PART_ON_GPU = 2**16  # number of uncertain points encoded at a time on a GPU, which keep it busy
 POINTS_AT_ONCE = 2**17  # number of uncertain points classified at a time, which limits the memory
@@ -162,6 +163,28 @@ def head_features(
     rows[..., -POINT_VALUES:] -= point[:, None, -POINT_VALUES:]
     point[:, -POINT_VALUES:-1] *= config.position_scale
     return point, rows
+
+
+def first_in_cubes(points: Tensor, index: Tensor, edge: float) -> tuple[Tensor, Tensor]:
+    """Return the first of some points of a scan in each cube of space that has any.
+
+    Args:
+        points: (P, 4), the points of the scan.
+        index: (U,) indices of the chosen points, ascending.
+        edge: the edge of a cube, metres; with 0, each point has a cube of its own.
+
+    Returns:
+        (V,) indices of the first points, and (U,) the place of each point's cube among them.
+    """
+    if not edge:
+        return index, torch.arange(len(index), device=index.device)
+
+    x, y, z = (points[index, :3].double() / edge).floor().long().unbind(1)
+    # Cubes with one number are 2^21 edges apart.
+    numbers = (x & CUBES) << 42 | (y & CUBES) << 21 | (z & CUBES)
+    occupied, cube = numbers.unique(return_inverse=True)
+    first = index.new_full((len(occupied),), len(points)).scatter_reduce_(0, cube, index, "amin")
+    return first, cube
 
 
 def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:

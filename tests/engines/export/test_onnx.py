@@ -189,6 +189,7 @@ def test_the_description_says_what_a_program_needs(exported: Exports, name: str)
     assert description["point_head"] == {
         "neighbours": 4,
         "position_scale": model.point_head.position_scale,
+        "cell": model.point_head.cell,
     }
 
     graphs = description["graphs"]

@@ -194,6 +194,7 @@ def describe_export(weights: Weights, method: MethodName, graphs: dict[str, Any]
         description["point_head"] = {
             "neighbours": head.neighbours,
             "position_scale": head.position_scale,
+            "cell": head.cell,
         }
 
     described = {"taxonomy": taxonomy.name, "classes": classes, "opset": OPSET, "graphs": graphs}
