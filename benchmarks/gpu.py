@@ -37,9 +37,9 @@ from amvnet import load
 from amvnet import read as read_scan
 from amvnet.cli.main import main as amvnet
 from amvnet.config.nested import to_dict
-from amvnet.config.parts import PARTS
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import (
+    PARTS,
     ModelConfig,
     PolarNetConfig,
     PolarViewConfig,

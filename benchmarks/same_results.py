@@ -77,7 +77,7 @@ model:
   range_view: {{width: 256}}
   polar_view: {{radial: 32, angular: 32, vertical: 8}}
   range_net: {{stem: 8, widths: {widths}, blocks: {blocks}, decoder: 16, head: 16, dropout: 0.1}}
-  polar_net: {{point_widths: [8, 16], pillar: 8, widths: [16, 16]}}
+  polar_net: {{point_widths: [8, 16], pillar: 8, widths: [16, 16], decoder: [16]}}
   assertion: {{threshold: 0.95}}
   point_head: {{neighbours: 4, hidden: [8, 8], fc: 8}}
 training:

@@ -154,16 +154,6 @@ def check_scan(scan: Scan) -> Scan:
     return scan
 
 
-def check_trainable(scan: Scan) -> None:
-    """Raise InputError if no network can be trained on a scan."""
-    valid = int(scan.valid.sum())
-    if valid < 2:  # batch norm needs two points to compute a variance
-        raise InputError(
-            f"{scan.name}: expected at least two valid points to train with, found {valid}; "
-            "leave the scan out"
-        )
-
-
 class TensorLike(Protocol):
     """The part of torch's tensors that `as_array` uses."""
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import amvnet
-from amvnet.config.parts import PARTS
-from amvnet.config.schema import RangeViewConfig, Recipe
+from amvnet.config.schema import PARTS, RangeViewConfig, Recipe
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.data.formats.cloud import WILD_SHARE, Cloud

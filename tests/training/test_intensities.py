@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amvnet.config.parts import PARTS
 from amvnet.config.recipes import load_recipe
-from amvnet.config.schema import Recipe, StageName
+from amvnet.config.schema import PARTS, Recipe, StageName
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import to_train

@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from amvnet.config.parts import PARTS
 from amvnet.config.recipes import load_recipe, recipe_names
-from amvnet.config.schema import TrainingConfig
+from amvnet.config.schema import PARTS, TrainingConfig
 from amvnet.runtime.distributed import device_of
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.stage import precision_of

@@ -20,8 +20,8 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from amvnet.config.parts import PARTS
 from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import PARTS
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import Source, TrainingData

@@ -18,7 +18,7 @@ from torch import Tensor
 import amvnet
 import amvnet.weights
 from amvnet.config.nested import to_dict
-from amvnet.config.parts import PARTS
+from amvnet.config.schema import PARTS
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.weights.file import Weights, built_in, load, save

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import amvnet
-from amvnet.config.parts import PARTS
+from amvnet.config.schema import PARTS
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
 from amvnet.models.methods import MethodName

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, overload
 
 from amvnet.config.bounds import Bounded, Range, Seed, Share
+from amvnet.config.nested import flat, to_dict
 
 NetworkName = Literal["rv", "bev"]  # of a stage that trains a network
 StageName = Literal[NetworkName, "head"]
@@ -255,6 +256,43 @@ class ModelConfig(Bounded):
     """Which points are uncertain."""
     point_head: PointHeadConfig = PointHeadConfig()
     """The point head."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the method.
+
+    Attributes:
+        name: its name in `AMVNet` and in weights.
+        sizes: the fields of `ModelConfig` that set its sizes.
+        short: its name in tables and figures.
+    """
+
+    name: str
+    sizes: tuple[str, ...]
+    title: str
+    short: str
+
+    def differences(self, model: ModelConfig, other: ModelConfig) -> list[str]:
+        """Return in words the sizes of the part in a model that differ in another model."""
+        others = dict(flat(to_dict(other), "model"))
+        found = []
+        for section in self.sizes:
+            for key, value in flat(to_dict(getattr(model, section)), f"model.{section}"):
+                if value != others[key]:
+                    found.append(f"{key} is {value}, not {others[key]}")
+        return found
+
+
+# The parts by the stage that trains each of them, in the order of the stages.
+PART_OF: dict[StageName, Part] = {
+    "rv": Part("range_net", ("range_view", "range_net"), "Range-view network", "RV"),
+    "bev": Part("polar_net", ("polar_view", "polar_net"), "Bird's-eye-view network", "BEV"),
+    "head": Part("point_head", ("assertion", "point_head"), "Point head", "head"),
+}
+NETWORK_STAGES: tuple[NetworkName, ...] = ("rv", "bev")
+PARTS = tuple(part.name for part in PART_OF.values())
+BOTH_NETWORKS = tuple(PART_OF[stage].name for stage in NETWORK_STAGES)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError, listed
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
-from amvnet.scan import check_trainable
+from amvnet.scan import Scan
 
 SHOWN_IDS = 5  # largest number of unknown ids that a message lists
 SHOWN_SCANS = 3  # largest number of broken scans that a message names
@@ -275,7 +275,8 @@ def check_scans(
             labelled[record.name] = record
     share = processes.share(list(labelled.values()))
     found: dict[str, Contents | str] = {}
-    for part in processes.gather(_read_all(dataset, share, progress)):
+    read = _read_all(dataset, share, progress)
+    for part in processes.gather(read):
         found |= part
 
     reports = {}
@@ -351,3 +352,13 @@ def _contents_of(dataset: Dataset, record: ScanFile, is_ground: np.ndarray) -> C
         raised(*shown, is_ground),
         hashlib.blake2b(scan.points.tobytes()).digest(),
     )
+
+
+def check_trainable(scan: Scan) -> None:
+    """Raise InputError if no network can be trained on a scan."""
+    valid = int(scan.valid.sum())
+    if valid < 2:  # batch norm needs two points to compute a variance
+        raise InputError(
+            f"{scan.name}: expected at least two valid points to train with, found {valid}; "
+            "leave the scan out"
+        )

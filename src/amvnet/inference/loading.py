@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from amvnet.config.parts import PARTS
+from amvnet.config.schema import PARTS
 from amvnet.data.datasets.files import ScanFiles
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.rows import parse_layout

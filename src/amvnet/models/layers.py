@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
+from amvnet.errors import InputError
 from amvnet.models.cpu_convolution import convolve, is_plain
 
 # oneDNN compiles code for each number of rows, and keeps the code for the last thousand. With
@@ -169,6 +171,16 @@ class AzimuthGRU(nn.Module):
 def upsample(x: Tensor, like: Tensor) -> Tensor:
     """Repeat the values of a coarse map (B, C, h, w) to the size (B, C, H, W) of `like`."""
     return F.interpolate(x, size=like.shape[-2:], mode="nearest")
+
+
+def load_part(net: nn.Module, part: str, parameters: Mapping[str, Tensor]) -> None:
+    """Load the parameters of a part of AMVNet; raise InputError if they do not fit its sizes."""
+    try:
+        net.load_state_dict(parameters)
+    except RuntimeError:
+        raise InputError(
+            f"expected parameters of {part} that fit its description, found others; train it again"
+        ) from None
 
 
 def freeze(module: nn.Module) -> None:

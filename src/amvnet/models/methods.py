@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from amvnet.config.parts import BOTH_NETWORKS, PART_OF, PARTS
+from amvnet.config.schema import BOTH_NETWORKS, PART_OF, PARTS
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:

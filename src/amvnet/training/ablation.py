@@ -10,8 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from amvnet.config.parts import BOTH_NETWORKS
-from amvnet.config.schema import ModelConfig, Recipe
+from amvnet.config.schema import BOTH_NETWORKS, ModelConfig, Recipe
 from amvnet.engines.precision import choose_device
 from amvnet.evaluation.analysis import SweptRow, swept_row
 from amvnet.evaluation.metrics import metrics

@@ -13,8 +13,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from amvnet.config.parts import PART_OF
-from amvnet.config.schema import StageName
+from amvnet.config.schema import PART_OF, StageName
 from amvnet.progress import Reporter
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights, part_state

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.config.parts import PART_OF
+from amvnet.config.schema import PART_OF
 from amvnet.data.check import check_scans
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.training_data import TrainingData
@@ -16,7 +16,7 @@ from amvnet.sensors.expectation import Expectation
 from amvnet.training.expectation import expectation_of
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights
-from amvnet.weights.parts import differences, for_classes, head_fits, replace_part, resized
+from amvnet.weights.parts import for_classes, replace_part
 
 # A dataset teaches a class if more than this share of its labelled points have it. A few points may
 # have it by mistake.
@@ -80,17 +80,17 @@ def first_weights(plan: Plan) -> Weights:
         is_trained = name in plan.stages
         if part not in begun.parts or not (is_trained or has_classes):
             continue
+        own, wanted = begun.model.point_head, plan.recipe.model.point_head
         # A new kind of head can be trained on the networks of any weights.
-        if name == "head" and is_trained and not head_fits(begun, plan.recipe.model):
+        if name == "head" and is_trained and (own.hidden, own.fc) != (wanted.hidden, wanted.fc):
             plan.report("head: new, because the head of the initial weights has other sizes")
             continue
-        weights = replace_part(weights, part, begun)
-        if is_trained:  # whatever sizes its initial weights state
-            weights = resized(weights, part, plan.recipe.model)
-        else:
-            kept = differences(init, part, plan.recipe.model)
-            if kept:
-                plan.report(f"{part}: is not trained, so it stays as in --init: {'; '.join(kept)}")
+        # What is trained has the recipe's sizes, whatever sizes its initial weights state.
+        sizes = plan.recipe.model if is_trained else begun.model
+        weights = replace_part(weights, part, begun, sizes)
+        kept = PART_OF[name].differences(sizes, plan.recipe.model)
+        if kept:
+            plan.report(f"{part}: is not trained, so it stays as in --init: {'; '.join(kept)}")
         if not has_classes:
             of_part = ", ".join(key for key in new if key.startswith(f"{part}."))
             plan.report(

@@ -6,8 +6,7 @@ import dataclasses
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 
-from amvnet.config.parts import BOTH_NETWORKS, NETWORK_STAGES, PART_OF
-from amvnet.config.schema import Recipe, StageName
+from amvnet.config.schema import BOTH_NETWORKS, NETWORK_STAGES, PART_OF, Recipe, StageName
 from amvnet.data.datasets.training_data import TrainingData
 from amvnet.data.recordings import evenly_spaced
 from amvnet.errors import InputError

@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
-from amvnet.config.parts import NETWORK_STAGES, PART_OF
-from amvnet.config.schema import HeadTraining
+from amvnet.config.schema import NETWORK_STAGES, PART_OF, HeadTraining
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
 from amvnet.models.point_head import PointHead

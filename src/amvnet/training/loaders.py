@@ -11,11 +11,12 @@ from torch import Tensor
 from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
+from amvnet.data.check import check_trainable
 from amvnet.data.datasets.training_data import TrainingData
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.runtime.distributed import ALONE, Processes
-from amvnet.scan import Scan, check_trainable
+from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 

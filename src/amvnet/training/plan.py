@@ -12,8 +12,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from amvnet.config.nested import to_dict
-from amvnet.config.parts import BOTH_NETWORKS, NETWORK_STAGES, PART_OF
-from amvnet.config.schema import NetworkName, Recipe, StageName
+from amvnet.config.schema import (
+    BOTH_NETWORKS,
+    NETWORK_STAGES,
+    PART_OF,
+    NetworkName,
+    Recipe,
+    StageName,
+)
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.training_data import (

@@ -11,8 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from amvnet.config.nested import flat, to_dict
-from amvnet.config.parts import PART_OF
-from amvnet.config.schema import Recipe, StageName
+from amvnet.config.schema import PART_OF, Recipe, StageName
 from amvnet.config.yaml_files import read_entries
 from amvnet.data.datasets.open import is_dataset
 from amvnet.errors import InputError, listed
@@ -135,15 +134,16 @@ class RunFolder:
                 input, or the folder is a dataset.
         """
         names = (RECIPE, RUN_WEIGHTS, COUNTS, CURVES, RECORD, *PART_OF)
-        check_not_read([self.path / name for name in names], also_read)
-        if self.is_run:
-            return
         expected = f"{self.path}: expected a new folder or the folder of a run"
-        if is_dataset(str(self.path)) or self.path.resolve() in [root.resolve() for root in roots]:
+        is_data = self.path.resolve() in [root.resolve() for root in roots]
+        if not self.is_run and (is_data or is_dataset(str(self.path))):
             raise InputError(f"{expected}, found a dataset; give another folder")
-        for name in names:
-            if os.path.lexists(self.path / name):
-                raise InputError(f"{expected}, found {name} without {RECORD}; give another folder")
+        check_not_read([self.path / name for name in names], also_read)
+        present = [name for name in names if os.path.lexists(self.path / name)]
+        if present and not self.is_run:
+            raise InputError(
+                f"{expected}, found {present[0]} without {RECORD}; give another folder"
+            )
 
     @contextmanager
     def alone(self, stage: StageName | Literal["all"]) -> Iterator[None]:

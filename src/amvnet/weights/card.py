@@ -11,7 +11,7 @@ from itertools import islice
 import yaml
 
 from amvnet.config.nested import flat
-from amvnet.config.parts import PART_OF
+from amvnet.config.schema import PART_OF
 from amvnet.models.methods import widest_method
 from amvnet.weights.file import Weights
 

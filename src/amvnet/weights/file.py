@@ -20,12 +20,12 @@ from torch import Tensor
 
 from amvnet.config.bounds import check_text
 from amvnet.config.nested import from_dict, to_dict
-from amvnet.config.parts import PARTS
-from amvnet.config.schema import ModelConfig
+from amvnet.config.schema import PARTS, ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, did_you_mean, reason_of, shown
 from amvnet.files import atomic_write, digest
 from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.models.layers import load_part
 from amvnet.models.point_head import PointHead
 from amvnet.sensors.expectation import Expectation
 from amvnet.weights import hub
@@ -157,9 +157,10 @@ class Weights:
         Raises:
             InputError: if the parameters do not fit the sizes.
         """
+        parameters = {part: self.part(part) for part in self.parts}
         model = build_amvnet(self.model, self.taxonomy.size)
-        for part in self.parts:
-            self._load_part(part, getattr(model, part))
+        for part, own in parameters.items():
+            load_part(getattr(model, part), part, own)
 
         if "point_head" not in self.parts and not with_head:
             model.point_head = None
@@ -177,17 +178,8 @@ class Weights:
             )
 
         head = PointHead(self.model.point_head, self.taxonomy.size)
-        self._load_part("point_head", head)
+        load_part(head, "point_head", self.part("point_head"))
         return head.eval()
-
-    def _load_part(self, part: str, module: torch.nn.Module) -> None:
-        try:
-            module.load_state_dict(self.part(part))
-        except RuntimeError:
-            raise InputError(
-                f"expected parameters of {part} that fit its description, found others; "
-                "train it again"
-            ) from None
 
 
 def part_state(part: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -1,30 +1,30 @@
-"""Change the parts of weights: replace one, or change its sizes or classes."""
+"""Change the parts of weights: replace one, or change the classes."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
 
 import torch
 
-from amvnet.config.nested import flat, to_dict
-from amvnet.config.parts import PART_OF
-from amvnet.config.schema import ModelConfig
+from amvnet.config.schema import PART_OF, ModelConfig
 from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
-from amvnet.models.point_head import PointHead
 from amvnet.weights.file import Weights
 
 # The fields of `ModelConfig` that set the sizes of each part.
 SIZES = {part.name: part.sizes for part in PART_OF.values()}
 
 
-def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
+def replace_part(
+    weights: Weights, part: str, other: Weights, sizes: ModelConfig | None = None
+) -> Weights:
     """Return weights in which one part, its sizes and its records come from other weights.
 
     They expect the scans of the other weights, to which the part was trained last.
+
+    Args:
+        sizes: has the sizes that the part is stated to have; by default those of the other weights.
 
     Raises:
         InputError: if the other weights lack the part or have other classes.
@@ -43,47 +43,24 @@ def replace_part(weights: Weights, part: str, other: Weights) -> Weights:
             f"{difference}; train this part for these classes, in another folder"
         )
 
+    sizes = sizes or other.model
     prefix = f"{part}."
     tensors = {key: weights.tensors[key] for key in weights.tensors if not key.startswith(prefix)}
     tensors |= {key: other.tensors[key] for key in other.tensors if key.startswith(prefix)}
-    return dataclasses.replace(
-        resized(weights, part, other.model),
+    training = {key: record for key, record in weights.training.items() if key != part}
+    metrics = {key: record for key, record in weights.metrics.items() if key != part}
+    if part in other.training:
+        training[part] = other.training[part]
+    if part in other.metrics:
+        metrics[part] = other.metrics[part]
+    return replace(
+        weights,
+        model=replace(weights.model, **{key: getattr(sizes, key) for key in SIZES[part]}),
         expects=other.expects,
         tensors=tensors,
-        training=_with_entry(weights.training, other.training, part),
-        metrics=_with_entry(weights.metrics, other.metrics, part),
+        training=training,
+        metrics=metrics,
     )
-
-
-def resized(weights: Weights, part: str, model: ModelConfig) -> Weights:
-    """Return weights in which the sizes of one part come from another configuration.
-
-    The parameters stay unchanged: also replace them before you build the model.
-    """
-    sizes = {key: getattr(model, key) for key in SIZES[part]}
-    return dataclasses.replace(weights, model=dataclasses.replace(weights.model, **sizes))
-
-
-def head_fits(weights: Weights, model: ModelConfig) -> bool:
-    """Return whether the parameters of the head have the sizes of another configuration."""
-    with torch.device("meta"):  # takes no memory
-        head = PointHead(model.point_head, weights.taxonomy.size)
-    try:
-        head.load_state_dict(weights.part("point_head"), assign=True)
-    except RuntimeError:
-        return False
-    return True
-
-
-def differences(weights: Weights, part: str, model: ModelConfig) -> list[str]:
-    """Return in words the sizes of one part that differ in another configuration."""
-    others = dict(flat(to_dict(model), "model"))
-    found = []
-    for section in SIZES[part]:
-        for key, value in flat(to_dict(getattr(weights.model, section)), f"model.{section}"):
-            if value != others[key]:
-                found.append(f"{key} is {value}, not {others[key]}")
-    return found
 
 
 def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weights, list[str]]:
@@ -108,11 +85,4 @@ def for_classes(weights: Weights, taxonomy: Taxonomy, seed: int) -> tuple[Weight
         tensors[key] = fresh[key] if depends_on_classes else tensor
         if depends_on_classes:
             new.append(key)
-    begun = dataclasses.replace(weights, taxonomy=taxonomy, tensors=tensors)
-    return dataclasses.replace(begun, metrics={}), new
-
-
-def _with_entry(records: Mapping[str, Any], others: Mapping[str, Any], part: str) -> dict[str, Any]:
-    """Return records by part, in which one part has its record of `others`, or no record."""
-    kept = {key: record for key, record in records.items() if key != part}
-    return kept | ({part: others[part]} if part in others else {})
+    return replace(weights, taxonomy=taxonomy, tensors=tensors, metrics={}), new

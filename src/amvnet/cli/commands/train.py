@@ -50,7 +50,7 @@ def train(
         with_val: also train on the validation scans, and skip the validation, as for an entry to a
             benchmark.
     """
-    from amvnet.config.parts import BOTH_NETWORKS
+    from amvnet.config.schema import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
     from amvnet.training.plan import Plan
     from amvnet.training.run import train as train_stages
