@@ -265,7 +265,7 @@ def test_any_number_of_workers_gives_the_same_fresh_streets(workers: int, tmp_pa
         for batch in loader:
             assert isinstance(batch, tuple)
             points, _, _ = batch
-            for name, part in zip(points.names, points.slices(), strict=True):
+            for name, part in zip(points.names, points.slices, strict=True):
                 names.append(name)
                 key = keys[len(names) - 1]
                 assert np.array_equal(points.points[part].numpy(), scans[key].points)

@@ -25,9 +25,9 @@ from amvnet.engines.compute import Precision
 from amvnet.engines.precision import InPrecision, choose_device, choose_precision
 from amvnet.engines.streams import TwoStreams
 from amvnet.inference.journal import Entry, Journal
-from amvnet.inference.listing import ScanOptions
 from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
+from amvnet.inference.reading import AS_FOUND
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import LateFusion
@@ -434,9 +434,9 @@ def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
     batch = PointBatch.of(scans)
 
     expected = [slice(0, 100), slice(100, 200), slice(200, 302)]
-    assert batch.slices() == expected
-    assert batch.to("cpu").slices() == expected
-    assert PointBatch(batch.points, batch.scan, 3).slices() == expected
+    assert batch.slices == expected
+    assert batch.to("cpu").slices == expected
+    assert PointBatch(batch.points, batch.scan, 3).slices == expected
 
 
 def test_several_scans_at_a_time_are_segmented_as_each_alone() -> None:
@@ -520,7 +520,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
         "precision": "float32",
         "tau": segmenter.engine.tau,
         "sensor": repr(Sensor()),
-        "layout": repr(ScanOptions().reading.layout),
+        "layout": repr(AS_FOUND.layout),
         "scores": False,
         "uncertain": False,
         "format": "label",

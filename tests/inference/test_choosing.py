@@ -12,7 +12,7 @@ import pytest
 import amvnet
 from amvnet.data.formats import find
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
-from amvnet.inference.listing import ScanOptions, find_inputs
+from amvnet.inference.listing import find_inputs
 from amvnet.inference.reading import Reading
 from amvnet.sensors import measure
 from amvnet.sensors.built_in import lasers_of, weights_for
@@ -84,8 +84,8 @@ def test_the_first_recording_chooses(tmp_path: Path, sensor: str, name: str, hei
 def test_a_described_sensor_chooses_whatever_the_points_show(tmp_path: Path) -> None:
     path = str(write(tmp_path / "scan.npy", "vlp16"))
     for sensor, name in (("hdl32e", "sim-hdl32e"), ("hdl64e", "sim-hdl64e"), ("os1-64", LAST)):
-        options = ScanOptions(reading=Reading(make_sensor(sensor)))
-        assert find_inputs([path], options).choose_weights()[0] == name
+        reading = Reading(make_sensor(sensor))
+        assert find_inputs([path], reading).choose_weights()[0] == name
 
 
 def test_the_classes_of_a_dataset_choose(tmp_path: Path) -> None:

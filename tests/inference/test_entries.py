@@ -526,7 +526,7 @@ def watched() -> Iterator[list[Seen]]:
     image = onnx_runner.range_image
 
     def record(batch: PointBatch) -> None:
-        (part,) = batch.slices()[-1:]
+        (part,) = batch.slices[-1:]
         rows = RangeView(LASERS_VIEW).rows(batch)
         seen.append((batch.points[part].numpy().copy(), rows[part].numpy().copy()))
 

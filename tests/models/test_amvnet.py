@@ -449,7 +449,7 @@ def test_a_batch_equals_each_scan_alone(random_scan: RandomScan, counts: tuple[i
     together = model(batch)
     assert together.uncertain.any()
 
-    for scan, rows in zip(scans, batch.slices(), strict=True):
+    for scan, rows in zip(scans, batch.slices, strict=True):
         alone = model(PointBatch.of([scan]))
         for name in ("rv", "bev", "merged", "uncertain"):
             values = getattr(together, name)[rows]

@@ -187,7 +187,7 @@ def test_a_batch_of_range_images_equals_one_by_one(random_scan: RandomScan) -> N
     batch = PointBatch.of(scans)
     together = RangeView(BY_RING).project(batch)
     pixels = BY_RING.height * BY_RING.width
-    for b, (scan, rows) in enumerate(zip(scans, batch.slices(), strict=True)):
+    for b, (scan, rows) in enumerate(zip(scans, batch.slices, strict=True)):
         alone = project_to_image(scan, BY_RING)
         assert torch.equal(together.image[b], alone.image[0])
         assert torch.equal(together.pixel[rows] - b * pixels, alone.pixel)
@@ -436,7 +436,7 @@ def test_every_point_gets_the_scores_of_its_voxel(random_scan: RandomScan) -> No
 
 def test_a_batch_of_polar_grids_equals_one_by_one(random_scan: RandomScan) -> None:
     scans = [random_scan(200, 1), degenerate_scans()["no point"], random_scan(150, 2)]
-    slices = PointBatch.of(scans).slices()
+    slices = PointBatch.of(scans).slices
     together = project_to_grid(*scans)
     maps = together.to_map(together.pool(together.features))
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from amvnet.data.recordings import ScanFile
     from amvnet.data.taxonomy import Taxonomy
     from amvnet.inference.drive import DriveOptions
-    from amvnet.inference.listing import Inputs, ScanOptions
+    from amvnet.inference.listing import Inputs
     from amvnet.inference.reading import Reading
     from amvnet.inference.request import LabellingRequest
     from amvnet.inference.scores import ScorePair
@@ -55,19 +55,24 @@ class ScanChoice:
     """the type of the numbers in .bin files, with --columns: float32, float64, ..., or a type for
     each column, separated by commas; default: float32."""
 
-    def parse(self, sensor: SensorChoice | None = None) -> ScanOptions:
-        """Return the options as `find_inputs` takes them.
+    def reading(self, sensor: SensorChoice | None = None) -> Reading:
+        """Return how files and bags are read.
 
         Raises:
             InputError: if a value cannot be parsed; or as `SensorChoice.parse`.
         """
         from amvnet.data.formats.rows import parse_layout
-        from amvnet.inference.listing import ScanOptions
         from amvnet.inference.reading import Reading
 
         layout = parse_layout(self.columns, self.dtype)
         described = UNKNOWN_SENSOR if sensor is None else sensor.parse()
-        return ScanOptions(self.sequences, self.split, Reading(described, layout, self.topic))
+        return Reading(described, layout, self.topic)
+
+    def find(self, inputs: Sequence[str], sensor: SensorChoice | None = None) -> Inputs:
+        """Return the inputs that a user names; the errors are those of `find_inputs`."""
+        from amvnet.inference.listing import find_inputs
+
+        return find_inputs(inputs, self.reading(sensor), self.sequences, self.split)
 
 
 @dataclass(frozen=True)
@@ -326,9 +331,7 @@ def open_inputs(
 
     The errors and the other arguments are those of `find_inputs` and `load_for`.
     """
-    from amvnet.inference.listing import find_inputs
-
-    found = find_inputs(inputs, choice.parse(sensor))
+    found = choice.find(inputs, sensor)
     return found, *load_for(found, weights, then)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -67,6 +68,12 @@ class WorldMap:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    def figures(self, scans: int) -> dict[str, Any]:
+        """Return the figures of a map of some scans, for JSON: all voxels, and those by class."""
+        counts = np.bincount(self.labels, minlength=self.taxonomy.size + 1).tolist()
+        classes = dict(zip(self.taxonomy.classes, counts[1:], strict=True))
+        return {"scans": scans, "voxels": len(self), "classes": classes}
 
     def write(self, path: Path) -> None:
         """Write the map as `.ply`, `.las` or `.laz`; the file appears whole or not at all.

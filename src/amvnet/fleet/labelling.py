@@ -33,7 +33,7 @@ from amvnet.fleet.results import DRIVES_SCHEMA, describe_drive, parse_estimate, 
 from amvnet.fleet.secrets import without_secrets
 from amvnet.fleet.storage import Place
 from amvnet.inference.drive import Broken, Outcome
-from amvnet.inference.listing import Inputs, ScanOptions
+from amvnet.inference.listing import Inputs
 from amvnet.inference.loading import load_with
 from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
@@ -209,7 +209,7 @@ def measure(drive: Sequence[Row], request: LabellingRequest) -> Row:
 def choose_weights(drive: Sequence[Row], reading: Reading) -> tuple[str, str]:
     """Return the name of built-in weights for a drive, and why, as `Inputs.choose_weights`."""
     with _fetch(drive, reading.layout) as (scans, _):
-        return Inputs([scans], ScanOptions(reading=reading)).choose_weights()
+        return Inputs([scans], reading).choose_weights()
 
 
 @contextmanager

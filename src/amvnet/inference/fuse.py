@@ -15,7 +15,7 @@ import torch
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.listing import ScanOptions, find_inputs
+from amvnet.inference.listing import Inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults, check_output
 from amvnet.inference.reading import checked_scan
 from amvnet.inference.scores import LEAST_PROBABILITY, ScorePair, as_probabilities, have_opinion
@@ -144,10 +144,9 @@ class Fused(NamedTuple):
 
 
 def fuse_files(
-    inputs: Sequence[str],
+    inputs: Inputs,
     pair: ScorePair,
     output: OutputOptions,
-    options: ScanOptions = ScanOptions(),
     *,
     head: Weights | None = None,
     tau: float | None = None,
@@ -169,7 +168,7 @@ def fuse_files(
     if head is not None:
         taxonomy = head.taxonomy
     normaliser = Normaliser(fusion.expects, Sensor(keep_own=True))  # the other models label it
-    scans, taxonomy = find_inputs(inputs, options).scans(taxonomy, normaliser)
+    scans, taxonomy = inputs.scans(taxonomy, normaliser)
     scores = []
     for scan in scans:  # raises before anything is written
         scores += [pair.a.find(scan.scores_path), pair.b.find(scan.scores_path)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
@@ -30,36 +30,27 @@ from amvnet.weights.file import Weights
 MEASURED_HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # of a sensor whose scans lie on the ground, metres
 
 
-@dataclass(frozen=True)
-class ScanOptions:
-    """The choice of scans from the inputs.
+@dataclass(eq=False)
+class Inputs:
+    """The inputs that a user names: `find_inputs` returns them, without reading a scan.
 
     Attributes:
-        sequences: the sequences or scenes to use of datasets; by default the sequences of `split`.
+        parts: datasets, and the scans of files and bags, in the user's order.
         reading: how files and bags are read.
+        sequences: the sequences or scenes to use of datasets; by default the sequences of `split`.
     """
 
+    parts: Sequence[Dataset]
+    reading: Reading = AS_FOUND
     sequences: Sequence[str] | None = None
     split: str = "all"
-    reading: Reading = AS_FOUND
-
-
-class Inputs:
-    """The inputs that a user names, in their order: datasets, and the scans of files and bags.
-
-    `find_inputs` returns them, without reading a scan.
-    """
-
-    def __init__(self, parts: Sequence[Dataset], options: ScanOptions = ScanOptions()) -> None:
-        self.reading = options.reading
-        self._parts = parts
-        self._options = options
-        self._known: tuple[Recording, Estimate | None] | None = None  # what chose the weights
+    # The recording that chose the weights, and what was measured of it.
+    _known: tuple[Recording, Estimate | None] | None = field(default=None, init=False)
 
     @property
     def taxonomies(self) -> list[Taxonomy]:
         """The classes of the datasets among the inputs."""
-        return [part.taxonomy for part in self._parts if not isinstance(part, ScanFiles)]
+        return [part.taxonomy for part in self.parts if not isinstance(part, ScanFiles)]
 
     def choose_weights(self) -> tuple[str, str]:
         """Return the name of built-in weights for the first recording, and in words why these.
@@ -70,7 +61,7 @@ class Inputs:
             InputError: if the only scan of the inputs cannot be read.
         """
         sensor = self.reading.sensor
-        part = self._parts[0]
+        part = self.parts[0]
         classes = None if isinstance(part, ScanFiles) else part.taxonomy
         recordings = part.recordings()
         if not recordings:  # nothing of a benchmark is measured
@@ -81,7 +72,7 @@ class Inputs:
         measured = Measured(sensor, MEASURED_HEIGHT)
         measured.learn(recordings[0].first(MEASURED_SCANS))
         usual = measured.usual
-        scans = [scan for each in self._parts for one in each.recordings() for scan in one.scans]
+        scans = [scan for each in self.parts for one in each.recordings() for scan in one.scans]
         if usual is None and len(scans) == 1:
             recordings[0].read(scans[0], keep=True)
         # If the origin lies on the ground, the lasers were measured as if from this height.
@@ -122,7 +113,7 @@ class Inputs:
             once = cache(normaliser)  # files of one recording may be in several parts
         scans: list[ScanFile] = []
         taxonomies: list[Taxonomy] = []
-        for part in self._parts:
+        for part in self.parts:
             dataset = part
             if taxonomy is not None:
                 dataset = with_classes(part, taxonomy)
@@ -135,7 +126,7 @@ class Inputs:
                 if normaliser.expected is not None:
                     mark = partial(mark_own, sensor=normaliser.sensor)
                     dataset.finish = None if official else mark
-            scans += choose_records(dataset, self._options.sequences, self._options.split)
+            scans += choose_records(dataset, self.sequences, self.split)
             taxonomies.append(dataset.taxonomy)
 
         if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
@@ -148,17 +139,22 @@ class Inputs:
         return list(chain.from_iterable(recordings.values())), taxonomies[0]
 
 
-def find_inputs(specs: Sequence[str], options: ScanOptions = ScanOptions()) -> Inputs:
+def find_inputs(
+    specs: Sequence[str],
+    reading: Reading = AS_FOUND,
+    sequences: Sequence[str] | None = None,
+    split: str = "all",
+) -> Inputs:
     """Return the inputs that a user names.
 
     Args:
         specs: each a dataset as `open_dataset` takes it, a scan file, a bag, a folder of these, or
             a pattern as `find_scans` takes it.
+        reading, sequences, split: as `Inputs` takes them.
 
     Raises:
         InputError: if an input is missing or has no scan.
     """
-    reading = options.reading
     parts: list[Dataset] = []
     folders: dict[str, Recording] = {}
     is_alone = len(specs) == 1
@@ -166,9 +162,10 @@ def find_inputs(specs: Sequence[str], options: ScanOptions = ScanOptions()) -> I
         if is_dataset(spec):
             parts.append(open_dataset(spec))
         else:
-            found = list_scans(spec, reading.topic, reading.layout, is_alone, folders)
-            parts.append(ScanFiles(list(found)))
-    return Inputs(parts, options)
+            parts.append(
+                ScanFiles(list_scans(spec, reading.topic, reading.layout, is_alone, folders))
+            )
+    return Inputs(parts, reading, sequences, split)
 
 
 class Scans(Sequence[Scan]):
@@ -232,5 +229,5 @@ def read_all(path: Path | str, topic: str | None = None) -> Scans:
     Raises:
         InputError: if there is no scan.
     """
-    scans, _ = find_inputs([str(path)], ScanOptions(reading=Reading(topic=topic))).scans()
+    scans, _ = find_inputs([str(path)], Reading(topic=topic)).scans()
     return Scans(path, scans)

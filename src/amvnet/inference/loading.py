@@ -18,7 +18,7 @@ from amvnet.engines.onnx import OnnxEngine
 from amvnet.engines.precision import resolved
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
-from amvnet.inference.listing import Inputs, ScanOptions
+from amvnet.inference.listing import Inputs
 from amvnet.inference.reading import AS_FOUND, Reading, array_cloud
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import Disagreement
@@ -139,8 +139,7 @@ def choose_by(cloud: Cloud, sensor: Sensor) -> tuple[str, str]:
     """Return the name of built-in weights for a scan in memory, and why, as `Inputs` does."""
     recording = Recording("scan")
     recording.scans.append(ScanFile("scan", recording, Path("scan"), read=lambda: cloud))
-    inputs = Inputs([ScanFiles(recording.scans)], ScanOptions(reading=Reading(sensor)))
-    return inputs.choose_weights()
+    return Inputs([ScanFiles(recording.scans)], Reading(sensor)).choose_weights()
 
 
 class ChoosingSegmenter(Segmenter):

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from amvnet.data.poses import Poses
 from amvnet.data.recordings import ScanFile
-from amvnet.drives.world_map import MapBuilder, WorldMap
+from amvnet.drives.world_map import MapBuilder
 from amvnet.inference.drive import Drives
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
@@ -36,7 +35,7 @@ def map_drive(
     drives: Drives,
     segmenter: Segmenter,
     builder: MapBuilder,
-    saved: SavedMap | None = None,
+    saved: SavedMap,
     progress: Progress = no_progress,
 ) -> None:
     """Segment the scans of a drive, and add them to a map, which `saved` keeps while unfinished.
@@ -49,21 +48,11 @@ def map_drive(
         result = segmenter(loaded, yaw=drives.yaws[scan])
         return loaded.points[:, :3], result, drives.motion(scan, loaded)
 
-    done = 0
-    if saved is not None and saved.resume:
-        done = builder.restore(saved.path, saved.request)
+    done = builder.restore(saved.path, saved.request) if saved.resume else 0
     for points, result, pose in stream_scans(
         scans[done:], lambda scan: scan.load(), segment, segmenter.at_once, progress
     ):
         builder.add(points, result.scores, pose)
         done += 1
-        if saved is not None and done % SAVED_SCANS == 0:
+        if done % SAVED_SCANS == 0:
             builder.save(saved.path, saved.request, done)
-
-
-def describe_map(world: WorldMap, scans: int) -> dict[str, Any]:
-    """Return the figures of a map, for JSON: its scans, its voxels, and its voxels by class."""
-    counts = np.bincount(world.labels, minlength=world.taxonomy.size + 1)
-    names = world.taxonomy.names
-    classes = {name: int(count) for name, count in zip(names[1:], counts[1:], strict=True)}
-    return {"scans": scans, "voxels": len(world), "classes": classes}

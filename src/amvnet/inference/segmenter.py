@@ -7,12 +7,11 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from amvnet.data.datasets.open import is_dataset
 from amvnet.data.recordings import Recording, ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
-from amvnet.inference.listing import Inputs, ScanOptions, find_inputs
+from amvnet.inference.listing import Inputs, find_inputs
 from amvnet.inference.reading import AS_FOUND, Reading, array_cloud, array_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
@@ -123,13 +122,7 @@ class Segmenter:
         if not isinstance(points, Path | str):
             return self._segment([self._read_array(points, columns)], [yaw])[0]
 
-        if is_dataset(str(points)):
-            raise InputError(
-                f"{points}: expected one scan, found a dataset; segment its scans with "
-                "Segmenter.each"
-            )
-        options = ScanOptions(reading=self.reading.by(columns))
-        scans = self._list(find_inputs([str(points)], options))
+        scans = self._list(find_inputs([str(points)], self.reading.by(columns)))
         if len(scans) > 1:
             raise InputError(
                 f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
@@ -153,15 +146,15 @@ class Segmenter:
     def _read_array(
         self, points: AnyArray | Scan, columns: str | Sequence[str] | None = None
     ) -> Scan:
-        """Return the scan of an array, normalised to the weights if its sensor is described."""
-        if isinstance(points, Scan):
-            return check_scan(points)
+        """Return a scan, or that of an array, normalised to the weights if its sensor is known."""
         expects = self.weights.expects
         sensor = self.reading.sensor
-        cloud = array_cloud(points, self.reading.by(columns).layout)
-        if sensor.is_known:
-            return Normaliser(expects, sensor)(Recording("scan")).to_scan(cloud)
-        return mark_own(array_scan(cloud, expects.intensity), sensor)
+        if not isinstance(points, Scan):
+            cloud = array_cloud(points, self.reading.by(columns).layout)
+            if sensor.is_known:
+                return Normaliser(expects, sensor)(Recording("scan")).to_scan(cloud)
+            return mark_own(array_scan(cloud, expects.intensity), sensor)
+        return check_scan(points)
 
     def _segment(self, scans: Sequence[Scan], yaws: Sequence[float] | None) -> list[Segmentation]:
         """Segment scans, each with a valid point, in one pass."""
@@ -171,7 +164,7 @@ class Segmenter:
             labels, scores = fetch(self.engine.score(batch))
 
         results = []
-        for scan, points in zip(scans, batch.slices(), strict=True):
+        for scan, points in zip(scans, batch.slices, strict=True):
             result = unpack(scan.valid, labels, scores, points)
             origin = Origin(scan, self.taxonomy, self.method, self.usual_uncertain)
             results.append(replace(result, origin=origin))
@@ -196,9 +189,8 @@ class Segmenter:
             InputError: if there is no scan. The iterator raises it if a scan cannot be read or
                 segmented.
         """
-        options = ScanOptions(reading=replace(self.reading, topic=topic))
         paths = [path] if isinstance(path, Path | str) else path
-        inputs = find_inputs(list(map(str, paths)), options)
+        inputs = find_inputs(list(map(str, paths)), replace(self.reading, topic=topic))
         return map(self._segment_input, self._list(inputs))
 
     def _list(self, inputs: Inputs) -> list[ScanFile]:

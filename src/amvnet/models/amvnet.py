@@ -92,7 +92,7 @@ class LateFusion(nn.Module):
         # The neighbours of a point are points of its own scan.
         config = self.point_head.config
         parts = []
-        for scan in batch.slices():
+        for scan in batch.slices:
             points = batch.points[scan]
             index = disputed[scan].nonzero()[:, 0]
             with self.watch("neighbours"):

@@ -48,7 +48,7 @@ def fleet(
     from amvnet.weights.file import load
 
     pipeline = import_optional("amvnet.fleet.pipeline", "fleet")
-    reading = ScanChoice(columns=columns, dtype=dtype).parse(sensor_choice).reading
+    reading = ScanChoice(columns=columns, dtype=dtype).reading(sensor_choice)
     if weights == AUTO:
         weights, reason = pipeline.choose_weights(inputs, out, reading)
         report(f"weights {weights}, {reason}")

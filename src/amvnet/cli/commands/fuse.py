@@ -57,10 +57,9 @@ def fuse(
 
     with progress("fusing") as step:
         fused = fuse_files(
-            inputs,
+            choice.find(inputs),
             pair,
             OutputOptions(out, overwrite=overwrite, also_read=(*inputs, head)),
-            choice.parse(),
             head=weights,
             tau=tau,
             taxonomy=classes,

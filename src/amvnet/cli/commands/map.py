@@ -54,7 +54,7 @@ def map(
     from amvnet.engines.precision import resolved
     from amvnet.files import alone_in, digest, write_json
     from amvnet.inference.drive import find_poses
-    from amvnet.inference.map import SavedMap, describe_map, map_drive
+    from amvnet.inference.map import SavedMap, map_drive
     from amvnet.outputs import check_outputs
 
     check_ending(out)
@@ -84,7 +84,7 @@ def map(
         world = builder.build(keep_movable)
         world.write(out)
         saved.path.unlink(missing_ok=True)
-        figures = describe_map(world, len(scans))
+        figures = world.figures(len(scans))
         if json is not None:
             write_json(json, figures)
 

@@ -13,7 +13,7 @@ from amvnet.cli.options import (
     join_processes,
     report_unused,
 )
-from amvnet.config.schema import Recipe
+from amvnet.config.schema import BOTH_NETWORKS, Recipe
 
 
 def train(
@@ -50,7 +50,6 @@ def train(
         with_val: also train on the validation scans, and skip the validation, as for an entry to a
             benchmark.
     """
-    from amvnet.config.schema import BOTH_NETWORKS
     from amvnet.runtime.distributed import device_of
     from amvnet.training.plan import Plan
     from amvnet.training.run import train as train_stages

@@ -50,7 +50,6 @@ def view(
     from amvnet.data.recordings import evenly_spaced
     from amvnet.data.taxonomy import TAXONOMIES
     from amvnet.files import make_folder
-    from amvnet.inference.listing import find_inputs
     from amvnet.outputs import check_outputs
     from amvnet.sensors.normalise import Normaliser
     from amvnet.viewing.page import PAGE, open_page, page_name, place_for_page, write_page
@@ -75,7 +74,7 @@ def view(
     named = None if taxonomy is None else TAXONOMIES[taxonomy]
     segmenter = None
     if weights is None:
-        found = find_inputs(inputs, choice.parse(sensor_choice))
+        found = choice.find(inputs, sensor_choice)
         found_scans, shown_classes = found.scans(
             named, Normaliser(None, found.reading.sensor, report)
         )

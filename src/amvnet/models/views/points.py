@@ -97,8 +97,9 @@ class PointBatch:
         x_squared, y_squared = xyz[:2].square()
         return torch.stack([(x_squared + y_squared).sqrt_(), torch.atan2(y, x), z])
 
+    @cached_property
     def slices(self) -> list[slice]:
-        """Return the slice of each scan's points."""
+        """The slice of each scan's points."""
         sizes = self.sizes or torch.bincount(self.scan, minlength=self.count).tolist()
         ends = list(accumulate(sizes))
         return [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
@@ -131,7 +132,7 @@ class PointBatch:
             names=tuple(scan.name for scan in scans),
             sizes=sizes,
         )
-        for index, (scan, mask, part) in enumerate(zip(scans, valid, batch.slices(), strict=True)):
+        for index, (scan, mask, part) in enumerate(zip(scans, valid, batch.slices, strict=True)):
             which = slice(None) if mask.all() else mask  # indexing by a slice makes no copy
             points.numpy()[part] = scan.points[which]
             scan_index[part].fill_(index)
