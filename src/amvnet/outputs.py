@@ -36,9 +36,19 @@ class Signature:
     unit: int = 1
 
     def matches(self, path: Path) -> bool:
-        """Return whether a file may be of this kind. An empty file may be of any kind."""
-        with path.open("rb") as file:
-            head = file.read(HEAD)
+        """Return whether a file may be of this kind. An empty file may be of any kind.
+
+        Raises:
+            InputError: if the file cannot be read.
+        """
+        try:
+            with path.open("rb") as file:
+                head = file.read(HEAD)
+        except OSError as error:
+            raise InputError(
+                f"{path}: expected {self.name} to replace, found a file that cannot be read "
+                f"({error.strerror}); write to another place, or remove it"
+            ) from None
         if not head:
             return True
         is_whole = path.stat().st_size % self.unit == 0
@@ -87,7 +97,7 @@ def check_outputs(
             "--overwrite to replace it"
         )
     for path in existing:
-        if path.exists() and not _matches(outputs[path], path):
+        if path.exists() and not outputs[path].matches(path):
             raise InputError(
                 f"{path}: expected {outputs[path].name} to replace, found another file; write to "
                 "another place, or remove it"
@@ -136,13 +146,3 @@ def _no_file(path: Path) -> str | None:
     if path.is_dir():
         return "a folder"
     return None if path.is_file() or path.is_symlink() else "a device"
-
-
-def _matches(signature: Signature, path: Path) -> bool:
-    try:
-        return signature.matches(path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: expected {signature.name} to replace, found a file that cannot be read "
-            f"({error.strerror}); write to another place, or remove it"
-        ) from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from json import dumps
 from pathlib import Path
 
 from amvnet.cli.console import progress, show
@@ -39,7 +38,7 @@ def bench(
     from amvnet.data.datasets.simulated import simulate
     from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
-    from amvnet.files import atomic_write, temporary_folder
+    from amvnet.files import temporary_folder, write_json
     from amvnet.inference.listing import find_inputs
     from amvnet.inference.timing import FIGURES, time_runs
     from amvnet.outputs import check_outputs
@@ -67,5 +66,4 @@ def bench(
 
     show(timing_table(report))
     if json is not None:
-        with atomic_write(json) as part:
-            part.write_text(dumps(report, indent=1))
+        write_json(json, report)
