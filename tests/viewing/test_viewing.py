@@ -457,10 +457,15 @@ def test_nuscenes_is_shown_with_its_truth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("count", "chosen"), [(1, ["00/000000"]), (2, ["00/000000", "08/000001"])])
 def test_scans_are_chosen_evenly(
-    world: Path, tmp_path: Path, count: int, chosen: list[str]
+    world: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    count: int,
+    chosen: list[str],
 ) -> None:
     page = view_page(tmp_path, world / "data", "--scans", count)
     assert scan_names(page) == chosen
+    assert f"{count} of 6 scans in" in capsys.readouterr().out
 
 
 MISTAKES = {

@@ -97,7 +97,8 @@ def view(
     with place_for_page(html) as page, progress("looking") as step:
         shown = show_scans(chosen, segmenter, labels, step, mapping)
         write_page(page, shown, shown_classes, _title(inputs, weights))
-    report(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")
+    part = f"{len(chosen)} of " if len(chosen) < len(found_scans) else ""
+    report(f"{part}{counted(len(found_scans), 'scan')} in {page}; open it in a browser")
     if html is None:
         open_page(page)
 
