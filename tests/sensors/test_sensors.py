@@ -348,6 +348,9 @@ def test_recordings_that_are_only_looked_at_share_a_line_if_they_are_alike() -> 
         (Sensor(height=0.9), ["0.90 m", "measured is 1.7"]),
         (KNOWN_SENSORS["os1-64"], ["64 lasers", "rings are 32", "-22.5 degrees"]),
         (Sensor(fov_up=10, fov_down=-10), ["-10.0 degrees", "points lie"]),
+        (Sensor(fov_up=90, fov_down=-90), ["+90.0 to -90.0 degrees", "points lie from +1"]),
+        (Sensor(fov_up=15, fov_down=-45), ["+15.0 to -45.0 degrees", "points lie from +1"]),
+        (Sensor(fov_up=60, fov_down=-30), []),  # there may be nothing above
         (Sensor(height=1.6), []),
         (KNOWN_SENSORS["vlp32c"], []),
         (Sensor(), []),

@@ -13,6 +13,7 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError, errors_of
 from amvnet.scan import Scan
 from amvnet.sensors.frame import QUICK_STEP, STEADY_TILT, Frame, find_frame, median_frame
+from amvnet.sensors.ground import MIN_DISTANCE
 from amvnet.sensors.intensity import are_of_one_range, quantiles_of
 from amvnet.sensors.laser_order import order_rings
 from amvnet.sensors.lasers import SensorGeometry, laser_density, measure_lasers
@@ -21,6 +22,8 @@ from amvnet.sensors.lidars import Sensor
 MEASURED_SCANS = 5  # number of measured scans in a recording; later scans get their median
 STEADY_HEIGHT = 0.4  # limit of the differences of height in a recording with one frame, metres
 OUTSIDE = 2.0  # smallest excess of points over a field of view that contradicts it, degrees
+UNSEEN = 10.0  # smallest part below all points, where there is ground, that contradicts it, degrees
+WIDER = 2.5  # smallest ratio of a field of view to that of all points that contradicts it
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,27 @@ class Estimate:
                 texts.append(
                     f"an end of the lasers at {end:+.1f} degrees, points lie at {seen:+.1f}"
                 )
+        if self._is_too_wide(sensor, known):
+            texts.append(
+                f"lasers from {sensor.fov_up:+.1f} to {sensor.fov_down:+.1f} degrees, points lie "
+                f"from {self.lasers.fov_up:+.1f} to {self.lasers.fov_down:+.1f}"
+            )
         return "; ".join(texts)
+
+    def _is_too_wide(self, sensor: Sensor, height: float | None) -> bool:
+        """Return whether the stated field of view is much wider than that of the points.
+
+        Lasers that see the sky have no points, but a laser that points down sees the ground, unless
+        this is nearer than `MIN_DISTANCE`.
+        """
+        seen = self.lasers.field_of_view
+        stated = SensorGeometry().override(sensor).field_of_view
+        if seen is None or stated is None:
+            return False
+        if np.ptp(stated) > WIDER * np.ptp(seen):
+            return True
+        sees_ground = height is not None and height > MIN_DISTANCE * np.tan(np.radians(-stated[1]))
+        return seen[1] - stated[1] > UNSEEN and sees_ground
 
 
 class Measured:

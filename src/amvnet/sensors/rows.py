@@ -86,7 +86,8 @@ def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) 
     """
     top, bottom = ends
     half = (top - bottom) / (2 * steps)
-    return dataclasses.replace(view, rows="elevation", fov_up=top + half, fov_down=bottom - half)
+    up, down = min(top + half, 90.0), max(bottom - half, -90.0)
+    return dataclasses.replace(view, rows="elevation", fov_up=up, fov_down=down)
 
 
 def _rows(scan: Scan, lasers: SensorGeometry, expected: Expectation) -> np.ndarray | None:
