@@ -114,6 +114,9 @@ def test_lasers_tell_a_low_sensor_from_the_foot_of_a_vehicle(name: str, height: 
     assert "the origin is not the sensor" in line
     assert "--offset 0,0,-Z if" in line
     assert "--offset" not in normalise(xyz, Sensor(offset=(0, 0, -1)))[1]
+    assert "over the ground" not in line
+    stated = normalise(xyz, Sensor(height=1.41))[1]
+    assert "sensor 1.41 m over the ground, the ground at" in stated
 
 
 @pytest.mark.parametrize("z", [-1.73, 0, 1.73])

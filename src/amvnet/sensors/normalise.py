@@ -364,7 +364,8 @@ def _describe_height(frame: Frame, sensor: Sensor, usual_height: float | None) -
     if rise:
         notes.append(f"moved by {rise:+.2f} m to {usual_height:.2f} m")
     if frame.is_on_ground(sensor):
-        text = f"the ground at {-(frame.height or 0):+.2f} m, so the origin is not the sensor"
+        place = f"the ground at {-(frame.height or 0):+.2f} m, so the origin is not the sensor"
+        text = place if sensor.height is None else f"{text}, {place}"
         if sensor.offset is None:
             notes.append("--offset 0,0,-Z if the sensor is Z m over the origin")
     return f"{text} ({'; '.join(notes)})" if notes else text
