@@ -11,7 +11,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from amvnet.engines import precision
-from amvnet.engines import torch as torch_engine
 from amvnet.engines.export import onnx as onnx_export
 from amvnet.scan import Scan
 
@@ -49,8 +48,7 @@ def on_cpu() -> Iterator[None]:
         return choose("cpu" if name == "auto" else name, engine)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (precision, torch_engine):
-            patch.setattr(module, "choose_device", choose_cpu)
+        patch.setattr(precision, "choose_device", choose_cpu)
         yield
 
 

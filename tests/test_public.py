@@ -141,7 +141,7 @@ def test_a_path_is_segmented_as_by_predict(tmp_path: Path, segmenter: Segmenter)
 
 def test_a_scan_of_a_dataset_keeps_its_labels(tmp_path: Path, segmenter: Segmenter) -> None:
     data = make_streets(tmp_path, ("00",))
-    fails(lambda: segmenter(data), "a dataset", "Segmenter.each")
+    fails(lambda: segmenter(data), "one scan", "Segmenter.each")
     first = next(segmenter.each(data))
     assert first.origin is not None
     assert first.origin.scan.labels is not None

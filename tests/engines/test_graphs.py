@@ -283,10 +283,9 @@ def engine_on_gpu(
 
     def make(graphs: bool = True) -> TorchEngine:
         with monkeypatch.context() as patch:
-            patch.setattr(torch_engine, "check_device", lambda name: "cpu")
             patch.setattr(torch_engine, "is_gpu", lambda device: True)
             patch.setattr(torch_engine, "TwoStreams", lambda device: one_after_the_other)
-            return TorchEngine(WEIGHTS, precision="float32", graphs=graphs)
+            return TorchEngine(WEIGHTS, graphs=graphs)
 
     return make
 

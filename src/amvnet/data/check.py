@@ -10,18 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from amvnet.data import plausible
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.plausible import (
-    GROUND,
-    MIN_FOLLOWING,
-    coarse_names,
-    following,
-    frequent_classes,
-    neighbours,
-    raised,
-    raised_classes,
-    scattered_classes,
-)
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError, listed
@@ -100,7 +90,7 @@ class SplitReport:
         self.scans_with += contents.points > 0
         self.neighbours += contents.neighbours
         self.raised += contents.raised
-        if following(contents.neighbours)[-1] < MIN_FOLLOWING:
+        if plausible.following(contents.neighbours)[-1] < plausible.MIN_FOLLOWING:
             self.stray.append(record.name)
 
         for raw_id, count in contents.unknown.items():
@@ -234,19 +224,19 @@ class Report:
 
     def _implausible(self, split: SplitReport) -> Iterator[str]:
         """Yield a line for each thing that is implausible in the labels of a split."""
-        frequent = ", ".join(frequent_classes(split.points, self.taxonomy))
+        frequent = ", ".join(plausible.frequent_classes(split.points, self.taxonomy))
         if frequent:
             yield (
                 f"more points than on any street are {frequent}; are the labels ids of another "
                 "table, such as train ids?"
             )
-        high = ", ".join(raised_classes(split.raised, split.points, self.taxonomy))
+        high = ", ".join(plausible.raised_classes(split.raised, split.points, self.taxonomy))
         if high:
             yield (
                 "expected the ground below everything else, found points more than 1 m above "
                 f"others at the same place: {high}; correct the ids or the labels"
             )
-        scattered = ", ".join(scattered_classes(split.neighbours, self.taxonomy))
+        scattered = ", ".join(plausible.scattered_classes(split.neighbours, self.taxonomy))
         if split.stray:
             yield (
                 f"labels do not follow the geometry in {len(split.stray)} of "
@@ -314,7 +304,9 @@ def _read_all(
     dataset: Dataset, records: Sequence[ScanFile], progress: Progress
 ) -> dict[str, Contents | str]:
     """Return the contents of scans, or the message about a broken scan, by the name of the scan."""
-    is_ground = np.array([name == GROUND for name in coarse_names(dataset.taxonomy)])
+    is_ground = np.array(
+        [name == plausible.GROUND for name in plausible.coarse_names(dataset.taxonomy)]
+    )
 
     def read(record: ScanFile) -> Contents | str:
         try:
@@ -348,8 +340,8 @@ def _contents_of(dataset: Dataset, record: ScanFile, is_ground: np.ndarray) -> C
     return Contents(
         np.bincount(labels, minlength=len(is_ground)),
         {int(raw_id): int(count) for raw_id, count in unknown.items()},
-        neighbours(*shown, dataset.taxonomy.size),
-        raised(*shown, is_ground),
+        plausible.neighbours(*shown, dataset.taxonomy.size),
+        plausible.raised(*shown, is_ground),
         hashlib.blake2b(scan.points.tobytes()).digest(),
     )
 

@@ -8,7 +8,7 @@ from torch import nn
 from amvnet.engines.base import Engine, WithUnet, build_model
 from amvnet.engines.compute import Precision
 from amvnet.engines.graphs import Captured, GraphCheck
-from amvnet.engines.precision import InPrecision, check_device, choose_device, choose_precision
+from amvnet.engines.precision import InPrecision
 from amvnet.engines.streams import TwoStreams, side_by_side
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.methods import MethodName
@@ -20,12 +20,12 @@ from amvnet.weights.file import Weights
 class TorchEngine(Engine):
     """Runs the two networks in PyTorch; `Engine` documents the attributes.
 
-    `amvnet.load` documents the arguments. With `graphs`, the networks are captured as CUDA graphs
-    (`engines.graphs`), once for each number of scans in a batch.
+    `amvnet.load` documents the arguments; the device and the precision are `resolved`. With
+    `graphs`, the networks are captured as CUDA graphs (`engines.graphs`), once for each number of
+    scans in a batch.
 
     Raises:
-        InputError: if the weights lack a part that the method needs, there is no such method,
-            device or precision, or tau is out of range.
+        InputError: as `build_model`.
     """
 
     def __init__(
@@ -34,12 +34,10 @@ class TorchEngine(Engine):
         method: MethodName = "amvnet",
         tau: float | None = None,
         *,
-        device: str = "auto",
-        precision: Precision = "auto",
+        device: str = "cpu",
+        precision: Precision = "float32",
         graphs: bool = True,
     ) -> None:
-        device = check_device(choose_device(device))
-        precision = choose_precision(precision, device)
         model = build_model(weights, method, tau, device)
 
         if is_gpu(device):

@@ -186,18 +186,13 @@ class ChoosingSegmenter(Segmenter):
                 cloud = Cloud(points.points[:, :3], points.points[:, 3], points.ring)
             else:
                 cloud = array_cloud(points, self.reading.by(columns).layout)
-            self._take(*self._choose_by(cloud))
+            # Unless the sensor is described, such points are not normalised: without rings, the
+            # networks would not know the lasers.
+            if cloud.ring is None and not self.reading.sensor.is_known:
+                self._take(*weights_for(SensorGeometry()))
+            else:
+                self._take(*choose_by(cloud, self.reading.sensor))
         return super()._read_array(points, columns)
-
-    def _choose_by(self, cloud: Cloud) -> tuple[str, str]:
-        """Return the name of the weights for points in memory, and in words why these.
-
-        Unless the sensor is described, such points are not normalised: without rings, the networks
-        would not know the lasers.
-        """
-        if cloud.ring is None and not self.reading.sensor.is_known:
-            return weights_for(SensorGeometry())
-        return choose_by(cloud, self.reading.sensor)
 
     def _take(self, name: str, reason: str) -> None:
         """Take the weights of a name."""
