@@ -19,7 +19,7 @@ from amvnet.drives.consensus import LEAST
 from amvnet.drives.world_map import MapBuilder
 from amvnet.errors import InputError
 from amvnet.files import alone_in, digest
-from amvnet.inference import map as mapping
+from amvnet.inference import drive as drive_module
 from amvnet.inference.drive import Drives
 from amvnet.inference.listing import find_inputs
 from amvnet.inference.reading import Reading
@@ -214,7 +214,7 @@ def test_a_map_that_was_stopped_is_resumed_to_the_same_map(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     succeed(command(world, tmp_path / "whole.ply"))
-    monkeypatch.setattr(mapping, "SAVED_SCANS", 2)
+    monkeypatch.setattr(drive_module, "SAVED_SCANS", 2)
     added = 0
     add = MapBuilder.add
 
@@ -268,7 +268,7 @@ def test_a_map_is_not_resumed_if_what_it_depends_on_changed(world: Path, tmp_pat
 def test_a_map_is_refused_before_the_work_if_it_has_no_place_of_its_own(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mapping, "map_drive", lambda *_: pytest.fail("the work has begun"))
+    monkeypatch.setattr(drive_module, "map_drive", lambda *_: pytest.fail("the work has begun"))
     out = tmp_path / "map.ply"
     refused(command(world, out, f"--json {tmp_path}/x/../map.ply"), "--json")
     long = f"{'m' * 252}.ply"

@@ -1,4 +1,4 @@
-"""Segment drives: the scores of each scan are fused with those of the scans around it."""
+"""Segment drives: the scores of scans are fused with those around them, or become a map."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from amvnet.data.poses import Poses, as_pose, check_rigid, read_poses, times_of
 from amvnet.data.recordings import Recording, ScanFile, by_recording, evenly_spaced
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit, check_steps
+from amvnet.drives.world_map import MapBuilder
 from amvnet.errors import InputError
 from amvnet.files import digest
+from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
@@ -40,6 +42,7 @@ ADVICE = {
 }
 OTHER_POSES = "give the poses of this drive's LiDAR in metres, or let them be estimated"
 LEAST_SCANS = 2  # smallest number of scans of a drive
+SAVED_SCANS = 50  # number of scans after which an unfinished map is saved again
 
 
 @dataclass(frozen=True)
@@ -206,6 +209,43 @@ def drive(
 
     for result, scores, _ in Consensus(past_only=past_only).stream(segmented()):
         yield with_scores(result, scores)
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """Where an unfinished map is saved; `request` tells it from others, `resume` continues it."""
+
+    path: Path
+    request: str
+    resume: bool
+
+
+def map_drive(
+    scans: Sequence[ScanFile],
+    drives: Drives,
+    segmenter: Segmenter,
+    builder: MapBuilder,
+    saved: SavedMap,
+    progress: Progress = no_progress,
+) -> None:
+    """Segment the scans of a drive, and add them to a map, which `saved` keeps while unfinished.
+
+    Raises:
+        InputError: if a scan cannot be read or segmented.
+    """
+
+    def segment(scan: ScanFile, loaded: Scan) -> tuple[np.ndarray, Segmentation, Poses]:
+        result = segmenter(loaded, yaw=drives.yaws[scan])
+        return loaded.points[:, :3], result, drives.motion(scan, loaded)
+
+    done = builder.restore(saved.path, saved.request) if saved.resume else 0
+    for points, result, pose in stream_scans(
+        scans[done:], lambda scan: scan.load(), segment, segmenter.at_once, progress
+    ):
+        builder.add(points, result.scores, pose)
+        done += 1
+        if done % SAVED_SCANS == 0:
+            builder.save(saved.path, saved.request, done)
 
 
 def with_scores(

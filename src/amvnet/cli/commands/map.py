@@ -53,8 +53,7 @@ def map(
     from amvnet.drives.world_map import FIGURES, SIGNATURES, MapBuilder, check_ending
     from amvnet.engines.precision import resolved
     from amvnet.files import alone_in, digest, write_json
-    from amvnet.inference.drive import find_poses
-    from amvnet.inference.map import SavedMap, map_drive
+    from amvnet.inference.drive import SavedMap, find_poses, map_drive
     from amvnet.outputs import check_outputs
 
     check_ending(out)
