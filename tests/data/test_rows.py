@@ -345,6 +345,8 @@ def test_a_pattern_takes_the_scans_of_many_drives(tmp_path: Path) -> None:
         (data.parent / "timestamps.txt").write_text("2011-09-26 13:02:25.594360375\n")
         (data / "0000000000.bin").write_bytes(np.ones((2, 4), np.float32).tobytes())
 
+    (data.parent / "classes").mkdir()
+    np.save(data.parent / "classes/0000000000.npy", np.ones(2, np.uint8))  # labels are no scans
     fails(lambda: list(list_scans(data.parents[1])), f"give the folder of scans, such as {data}")
     names = [scan.name for scan in list_scans(tmp_path / "*/velodyne_points/data")]
     folder = "_sync/velodyne_points/data/0000000000"

@@ -219,9 +219,12 @@ def _advice_to_find(path: Path) -> str:
     if any(path.glob("*.label")):
         return "it holds labels, give the folder of the points"
     for pattern in ("*/*", "*/*/*"):
-        for deeper in sorted(path.glob(pattern)):
-            if is_scan_file(deeper) and not deeper.parent.name.startswith("."):
-                return f"give the folder of scans, such as {deeper.parent}"
+        deeper = sorted(filter(is_scan_file, path.glob(pattern)), reverse=True)
+        first = {file.parent: file for file in deeper if not file.parent.name.startswith(".")}
+        for folder in sorted(first):
+            with suppress(InputError):  # arrays of labels have the names of scans
+                next(list_scans(first[folder])).read()
+                return f"give the folder of scans, such as {folder}"
     return "give the folder of scans"
 
 
