@@ -233,6 +233,25 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
     assert iou["building"] == pytest.approx(matrix[2] / (matrix[2] + matrix[3]))
 
 
+def test_labels_that_predict_wrote_with_a_map_are_scored_with_the_same_map_alone(
+    tmp_path: Path,
+) -> None:
+    data = make_streets(tmp_path / "data")
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    swap = {"building": {"from": ["road", "car"], "id": 40}, "road": {"from": ["building"]}}
+    few = write_map(tmp_path / "few.yaml", swap)
+    out, figures = tmp_path / "out", tmp_path / "figures.json"
+    succeed("predict", data, "--weights", weights, "--classes", few, "--out", out)
+    reports = []
+    for labels in (("--weights", weights), ("--predictions", out)):
+        options = ("--classes", few, "--json", figures, "--overwrite")
+        succeed("evaluate", data, *labels, *options)
+        reports.append(json.loads(figures.read_text())["methods"])
+    assert reports[0]["amvnet"] == reports[1]["predictions"]
+    for options in ((), ("--classes", "coarse")):
+        refused(("evaluate", data, "--predictions", out, *options), "the --classes of predict")
+
+
 def test_a_point_whose_predicted_class_the_map_does_not_name_is_wrong(tmp_path: Path) -> None:
     data = make_streets(tmp_path / "data")
     few = write_map(tmp_path / "few.yaml", {"ground": ["road", "sidewalk"], "house": ["building"]})

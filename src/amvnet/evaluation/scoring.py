@@ -22,6 +22,7 @@ from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import PICTURE, TopView, draw_scan
 from amvnet.files import inside
 from amvnet.inference.drive import Drives
+from amvnet.inference.journal import read_journals
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import expand_labels, expand_to_scan, scores_by_method
 from amvnet.inference.segmenter import Segmenter
@@ -74,7 +75,7 @@ class Labeller:
 
     def table(self, taxonomy: Taxonomy) -> np.ndarray:
         """Return the (K + 1,) uint8 train ids that are scored, by the K + 1 ids of a taxonomy."""
-        if self.classes is None:
+        if self.classes is None or taxonomy is self.classes.target:
             return np.arange(taxonomy.size + 1, dtype=np.uint8)
         return self.classes.table(taxonomy)
 
@@ -234,13 +235,27 @@ def labels_by_method(
 def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = None) -> Labeller:
     """Return a labeller that reads predictions from a folder.
 
+    They have the classes of the dataset, or those of the map with which `predict` wrote them.
+
     Raises:
-        InputError: if there is no such folder.
+        InputError: if there is no such folder, or `predict` wrote other classes.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 
-    def label(record: ScanFile, scan: Scan) -> MethodLabels:
-        return MethodLabels({"predictions": dataset.read_prediction(record, folder)})
+    taxonomy = dataset.taxonomy
+    for settings in read_journals(folder).settings:
+        written = settings.get("classes")
+        if classes is not None and written == repr(classes):
+            taxonomy = classes.target
+        elif written is not None:
+            raise InputError(
+                f"{folder}: expected labels with the classes of the data or of --classes, found "
+                "classes that another map made; give the --classes of predict"
+            )
 
-    return Labeller(label, dataset.taxonomy, classes)
+    def label(record: ScanFile, scan: Scan) -> MethodLabels:
+        ids = dataset.read_prediction(record, folder, len(scan), taxonomy)
+        return MethodLabels({"predictions": ids})
+
+    return Labeller(label, taxonomy, classes)
