@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import amvnet
+from amvnet.cli import tables
 from amvnet.cli.main import COMMANDS, GROUPS, main
 from amvnet.cli.tables import EXTRAS
 from amvnet.config.recipes import recipe_names
@@ -336,6 +338,15 @@ def test_info_says_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None
     text = capsys.readouterr().out
     for word in ("torch", "lightning", "sim-hdl64e", "cpu"):
         assert word in text
+
+
+def test_the_table_of_extras_fits_into_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "_version", lambda name: tables.MISSING)
+    console = Console(width=80)
+    with console.capture() as capture:
+        console.print(tables.extras_table())
+    rows = capture.get().splitlines()[3:]
+    assert [row.split()[0] for row in rows] == list(tables.EXTRAS)
 
 
 # ---- bench

@@ -31,7 +31,7 @@ EXTRAS = {
     "formats": ".las, .laz and bags",
     "feather": ".feather",
     "drives": "poses of drives that have none",
-    "export": "amvnet export, --engine onnx and int8",
+    "export": "export, --engine onnx and int8",
     "fleet": "amvnet fleet",
     "hub": "weights on the Hugging Face hub",
 }
