@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from amvnet.data.check import check_scans
+from amvnet.data.check import Report, check_scans
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.plausible import following, neighbours
@@ -53,18 +53,23 @@ def write_labels(path: Path, raw: np.ndarray) -> None:
     raw.astype(np.uint32).tofile(path)
 
 
+def checked(data: Path) -> Report:
+    """Return the report on the scans to train on and to validate with."""
+    dataset = open_own(data)
+    splits = {name: dataset.records(dataset.sequences(name)) for name in ("train", "val")}
+    return check_scans(dataset, splits)
+
+
 each_command = pytest.mark.parametrize("command", first_of(("check", "train")))
 
 
 def refusal_by(command: str, data: Path) -> str:
-    """Check data that must be refused, or start a training with them; return the message."""
-    if command == "train":
-        return train(data)
-    return refusal("check", data)
+    """Check data that must be refused, or start a training with them; return the line.
 
-
-def train(data: Path) -> str:
-    """Start a training that must be refused before it makes its folder; return its line."""
+    The training is refused before it makes its folder.
+    """
+    if command == "check":
+        return refusal("check", data)
     recipe = write_recipe(data.parent / "recipe.yaml")
     error = refusal("train", recipe, "--data", data, "--out", data.parent / "run")
     assert not (data.parent / "run").exists()
@@ -72,9 +77,7 @@ def train(data: Path) -> str:
 
 
 def test_points_and_scans_are_counted_by_class(data: Path) -> None:
-    dataset = open_own(data)
-    splits = {split: dataset.records(dataset.sequences(split)) for split in ("train", "val")}
-    report = check_scans(dataset, splits)
+    report = checked(data)
     once = [np.count_nonzero(raw == RAW) for raw in (40, 3, 7, 11)]
     for split, scans in (("train", 4), ("val", 2)):
         assert report.splits[split].points.tolist() == [scans * count for count in once]
@@ -173,7 +176,7 @@ def test_only_broken_scans_are_named(data: Path, capsys: pytest.CaptureFixture[s
 def test_no_training_starts_with_broken_scans(data: Path) -> None:
     (data.parent / "a/1.npy").write_bytes(b"no array")
     np.save(data.parent / "c/0.npy", np.full((60, 4), np.nan))
-    line = train(data)
+    line = refusal_by("train", data)
     assert "found 2 of 6 scans that cannot" in line
     assert " more;" not in line
     assert "a/1.npy" in line
@@ -233,9 +236,7 @@ def warnings_of(data: Path, change: Change, **described: Any) -> list[str]:
             points, raw = change(*a_street(2 * number + index))
             np.save(data.parent / f"{site}/{index}.npy", points)
             write_labels(data.parent / f"{site}/{index}.label", raw)
-    dataset = open_own(describe(data.parent, **described))
-    splits = {name: dataset.records(dataset.sequences(name)) for name in ("train", "val")}
-    return list(check_scans(dataset, splits).warnings())
+    return list(checked(describe(data.parent, **described)).warnings())
 
 
 @pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2, 1), (2, 1, 0)], ids=["z up", "y up", "x up"])
@@ -328,9 +329,7 @@ def test_shares_that_no_street_has_are_reported(data: Path) -> None:
 
 def test_scans_that_also_validate_are_reported_by_their_points(data: Path) -> None:
     np.save(data.parent / "c/1.npy", np.load(data.parent / "b/0.npy"))
-    dataset = open_own(data)
-    splits = {name: dataset.records(dataset.sequences(name)) for name in ("train", "val")}
-    (line,) = (line for line in check_scans(dataset, splits).warnings() if "same points" in line)
+    (line,) = (line for line in checked(data).warnings() if "same points" in line)
     assert line.startswith("val: 1 scan with the same points as in train, such as c/1 and b/0;")
 
 

@@ -48,7 +48,9 @@ def only_scan(folder: Path, **changes: Any) -> np.ndarray | None:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
+    """A folder with one scan, a.npy."""
     (tmp_path / "site").mkdir()
+    np.save(tmp_path / "site/a.npy", some_points())
     return tmp_path / "site"
 
 
@@ -59,7 +61,6 @@ def test_a_missing_yaml_file_is_not_called_a_folder(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.int64])
 def test_labels_are_integers_of_any_size(site: Path, dtype: type[np.integer[Any]]) -> None:
-    np.save(site / "a.npy", some_points())
     RAW.astype(dtype).tofile(site / "a.label")
     np.testing.assert_array_equal(only_scan(site.parent), EXPECTED)
 
@@ -239,7 +240,6 @@ def test_evaluate_scores_the_val_scans(tmp_path: Path, capsys: pytest.CaptureFix
 
 @pytest.mark.parametrize("ignored", ["rest", ["rest"], [40, "rest"]])
 def test_the_rest_of_the_ids_can_be_ignored(site: Path, ignored: Any) -> None:
-    np.save(site / "a.npy", some_points())
     raw = np.where(RAW == 40, np.arange(60) + 1000, RAW)
     raw.astype(np.uint32).tofile(site / "a.label")
     np.testing.assert_array_equal(only_scan(site.parent, ignored=ignored), EXPECTED)
@@ -250,7 +250,6 @@ def test_the_rest_of_the_ids_can_be_ignored(site: Path, ignored: Any) -> None:
 
 
 def test_ids_before_names_are_told_to_come_after_them(site: Path) -> None:
-    np.save(site / "a.npy", some_points())
     path = site.parent / "own.yaml"
     path.write_text("classes: {0: ground, 1: plant}\nscans: '*/*.npy'\n")
     fails(lambda: open_own(path), path, "found 0: 'ground'", "write the name first")
@@ -258,7 +257,6 @@ def test_ids_before_names_are_told_to_come_after_them(site: Path) -> None:
 
 @pytest.mark.parametrize("text", ["{no: 1, b: 2}", "{1: 1, b: 2}", "{a: 1, b: 2, 'a': 3}"])
 def test_names_that_yaml_changes_or_drops_are_refused(site: Path, text: str) -> None:
-    np.save(site / "a.npy", some_points())
     path = site.parent / "own.yaml"
     path.write_text(f"classes: {text}\nscans: '*/*.npy'\n")
     fails(lambda: open_own(path), path, "twice" if "'a'" in text else "quotes")
@@ -278,22 +276,19 @@ def test_the_classes_that_differ_are_named(tmp_path: Path) -> None:
         fails(partial(own.labelled, own.records(own.sequences("all"))), "own.yaml", *words)
 
 
-def test_label_files_that_match_the_pattern_of_scans_are_no_scans(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", some_points())
-    np.save(tmp_path / "a_labels.npy", RAW)
-    labels = only_scan(tmp_path, scans="*.npy", labels="{name}_labels.npy")
-    np.testing.assert_array_equal(labels, EXPECTED)
+@pytest.mark.parametrize("labels", [".truth.npy", "{name}_labels.npy"])
+def test_label_files_that_match_the_pattern_of_scans_are_no_scans(site: Path, labels: str) -> None:
+    np.save(site / f"a{labels.removeprefix('{name}')}", RAW)
+    np.testing.assert_array_equal(only_scan(site.parent, labels=labels), EXPECTED)
 
-
-def test_label_files_are_no_scans_for_weights_of_other_classes_either(tmp_path: Path) -> None:
-    """They match the pattern of the scans, and are not read."""
-    (tmp_path / "site").mkdir()
-    np.save(tmp_path / "site/a.npy", some_points())
-    np.save(tmp_path / "site/a.truth.npy", RAW)
-    data = open_own(str(describe(tmp_path, labels=".truth.npy"))).with_classes(SEMANTICKITTI)
+    # Nor for weights of other classes, for which their ids would mean others.
+    data = open_own(str(site.parent / "own.yaml")).with_classes(SEMANTICKITTI)
     (record,) = data.records(data.sequences("all"))
     assert record.name == "site/a"
+    assert data.taxonomy == SEMANTICKITTI
+    assert record.labels_path is None
     assert data.read(record).labels is None
+    fails(lambda: data.labelled([record]), "weights with the classes of the data")
 
 
 def test_predictions_of_other_ids_are_told_which_to_write(site: Path) -> None:
@@ -308,7 +303,6 @@ def test_predictions_of_other_ids_are_told_which_to_write(site: Path) -> None:
 
 
 def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> None:
-    np.save(site / "a.npy", some_points())
     data = open_own(describe(tmp_path))
     (record,) = data.records(["site"])
     path = data.write_labels(record, tmp_path / "out", data.read(record), EXPECTED)
@@ -319,7 +313,6 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("number", ["1:30", "1:30.5", "01", "1_0"])
 def test_what_yaml_alone_takes_for_a_number_is_refused_as_a_number(site: Path, number: str) -> None:
-    np.save(site / "a.npy", some_points())
     path = describe(site.parent, classes=None)
     text = path.read_text()
     path.write_text(f"{text}classes: {{ground: {number}}}\n")
@@ -364,11 +357,14 @@ def test_folders_may_be_named_as_numbers_and_dates(tmp_path: Path, name: str) ->
         ({"split": {"training": "a"}}, "training"),
         ({"clases": {}, "extra": 1}, "extra"),
         ({"clases": {"a": 1}}, "found 'clases'; did you mean classes?"),
+        ({"clases": {"a": 1}}, "own.yaml: expected keys of"),
+        ({"columns": ["x", "y"]}, "own.yaml: columns: expected x, y and z"),
+        ({"columns": ["x", "y", "z"], "dtype": "float33"}, "own.yaml: dtype: expected float32"),
+        ({"dtype": "float64"}, "own.yaml: dtype: expected columns, and one type"),
         ({"split": {"vall": "a"}}, "found 'vall'; did you mean val?"),
     ],
 )
 def test_mistakes_in_the_file_are_one_line(site: Path, changes: dict[str, Any], word: str) -> None:
-    np.save(site / "a.npy", some_points())
     path = describe(site.parent, **changes)
     fails(lambda: open_own(path), path.name if word != "found none" else word, word)
 
@@ -384,23 +380,8 @@ def test_mistakes_in_rows_are_answered_by_keys_of_the_file(site: Path, columns: 
         data.read(record, labels=False)
 
 
-def test_wrong_columns_in_the_file_are_called_by_its_keys(site: Path) -> None:
-    for changes, words in (
-        ({"columns": ["x", "y"]}, "own.yaml: columns: expected x, y and z"),
-        ({"columns": ["x", "y", "z"], "dtype": "float33"}, "own.yaml: dtype: expected float32"),
-        ({"dtype": "float64"}, "own.yaml: dtype: expected columns, and one type"),
-    ):
-        fails(partial(open_own, describe(site.parent, **changes)), words)
-
-
-def test_a_typo_in_a_key_follows_the_name_of_the_file(site: Path) -> None:
-    path = describe(site.parent, clases={"a": 1})
-    fails(lambda: open_own(path), f"{path}: expected keys of")
-
-
 @pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
 def test_a_file_of_another_encoding_is_told_to_be_utf_8(site: Path, encoding: str) -> None:
-    np.save(site / "a.npy", some_points())
     path = describe(site.parent)
     text = f"# schön\r\n{path.read_text()}"
     path.write_bytes(text.encode(encoding))
@@ -454,41 +435,31 @@ def test_dots_after_a_link_lead_to_the_folder_above_its_target(tmp_path: Path) -
 
 def test_a_column_of_labels_is_named_by_its_number(site: Path) -> None:
     """Labels of Waymo are instances and classes."""
-    np.save(site / "a.npy", some_points())
     np.save(site / "a.waymo.npy", np.column_stack([np.arange(60), RAW]))
-    labels = {"file": ".waymo.npy", "field": 1}
-    changes = {"scans": "site/a.npy", "labels": labels}
-    np.testing.assert_array_equal(only_scan(site.parent, **changes), EXPECTED)
+    labels = only_scan(site.parent, labels={"file": ".waymo.npy", "field": 1})
+    np.testing.assert_array_equal(labels, EXPECTED)
 
 
 def test_nan_is_no_label(site: Path) -> None:
     """CloudCompare writes it for points without a value."""
-    np.save(site / "a.npy", some_points())
     labels = RAW.astype(np.float32)
     labels[::5] = np.nan
     np.save(site / "a.labels.npy", labels)
-    changes = {"scans": "site/a.npy", "labels": ".labels.npy"}
     expected = np.where(np.arange(60) % 5, EXPECTED, 0)
-    np.testing.assert_array_equal(only_scan(site.parent, **changes), expected)
+    np.testing.assert_array_equal(only_scan(site.parent, labels=".labels.npy"), expected)
 
 
 def test_labels_that_are_true_or_false_are_1_and_0(site: Path) -> None:
     is_car = np.arange(60) % 2 == 0
-    np.save(site / "a.npy", some_points())
     np.save(site / "a.labels.npy", is_car)
-    changes = {
-        "scans": "site/a.npy",
-        "labels": ".labels.npy",
-        "classes": {"other": 0, "car": 1},
-        "ignored": [9],
-    }
+    classes = {"other": 0, "car": 1}
+    changes = {"labels": ".labels.npy", "classes": classes, "ignored": [9]}
     np.testing.assert_array_equal(only_scan(site.parent, **changes), 2 - is_car)
     np.save(site / "a.npy", some_points() > 0)  # no points
     fails(lambda: only_scan(site.parent, **changes), "bool")
 
 
 def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
-    np.save(site / "a.npy", some_points())
     path = site / "a.label"
 
     RAW[:-1].astype(np.uint32).tofile(path)
@@ -510,15 +481,3 @@ def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
     fails(lambda: read_scan_labels(site / "none.npy", 60, SEMANTICKITTI), "no file")
     np.save(site / "evil.npy", np.array([{}], object), allow_pickle=True)
     fails(lambda: read_scan_labels(site / "evil.npy", 1, SEMANTICKITTI), "evil.npy")
-
-
-def test_with_other_classes_the_scans_have_no_labels(site: Path) -> None:
-    """Their ids would mean other classes."""
-    np.save(site / "a.npy", some_points())
-    RAW.astype(np.uint32).tofile(site / "a.label")
-    data = open_own(describe(site.parent)).with_classes(SEMANTICKITTI)
-    (record,) = data.records(["site"])
-    assert data.taxonomy == SEMANTICKITTI
-    assert record.labels_path is None
-    assert data.read(record).labels is None
-    fails(lambda: data.labelled([record]), "weights with the classes of the data")

@@ -30,8 +30,14 @@ def table() -> np.ndarray:
     return np.column_stack([points, ring, time])
 
 
-def row_bytes(table: np.ndarray, dtype: str) -> bytes:
+def row_bytes(table: np.ndarray, dtype: str = "float32") -> bytes:
     return table.astype(dtype).tobytes()
+
+
+def write_rows(folder: Path, table: np.ndarray, dtype: str = "float32") -> Path:
+    path = folder / "a.bin"
+    path.write_bytes(row_bytes(table, dtype))
+    return path
 
 
 @pytest.mark.parametrize("order", ["as recorded", "shuffled"])
@@ -41,10 +47,7 @@ def test_the_columns_of_kitti_and_nuscenes_are_told_by_the_values(
 ) -> None:
     if order == "shuffled":
         table = np.random.default_rng(0).permutation(table)
-    path = tmp_path / "a.bin"
-    path.write_bytes(row_bytes(table[:, : len(columns)], "float32"))
-
-    cloud = read_cloud(path)
+    cloud = read_cloud(write_rows(tmp_path, table[:, : len(columns)]))
     np.testing.assert_array_equal(cloud.xyz, table[:, :3].astype("f4"))
     np.testing.assert_array_equal(cloud.intensity, table[:, 3].astype("f4"))
     assert (cloud.ring is not None) == ("r" in columns)
@@ -62,7 +65,7 @@ def rows_of_other_layouts(table: np.ndarray) -> dict[str, bytes]:
         "colours": np.column_stack([table[:, :3], rng.integers(0, 256, (len(table), 3))]),
         "standardised": table[:, :4] - [0, 0, 0, 0.5],
     }
-    files = {name: row_bytes(rows, "float32") for name, rows in tables.items()}
+    files = {name: row_bytes(rows) for name, rows in tables.items()}
     for count in (3, 4, 5, 6):
         files[f"{count} doubles"] = row_bytes(table[:, :count], "float64")
         files[f"{count} doubles of floats"] = row_bytes(table.astype("f4")[:, :count], "float64")
@@ -83,8 +86,7 @@ def test_lost_and_wild_points_do_not_hide_the_columns(table: np.ndarray, tmp_pat
     rows = table[:, :4].astype("f4")
     rows[::7, :3] = np.nan
     rows[1] = (1e6, 0, 0, -1)
-    (tmp_path / "a.bin").write_bytes(rows.tobytes())
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.bin").xyz, rows[:, :3])
+    np.testing.assert_array_equal(read_cloud(write_rows(tmp_path, rows)).xyz, rows[:, :3])
 
 
 @pytest.mark.parametrize("columns", [4, 5])
@@ -96,9 +98,7 @@ def test_lost_returns_may_have_any_value_that_is_no_place(
     rows[::3, :3] = value
     rows[::6, 3] = -1  # as simulators write for a lost return
     rows[3::6, 3] = value
-    (tmp_path / "a.bin").write_bytes(rows.tobytes())
-
-    cloud = read_cloud(tmp_path / "a.bin")
+    cloud = read_cloud(write_rows(tmp_path, rows))
     np.testing.assert_array_equal(cloud.xyz, rows[:, :3])
     scan = cloud.to_scan()
     assert scan.valid.tolist() == [index % 3 > 0 for index in range(len(rows))]
@@ -106,7 +106,7 @@ def test_lost_returns_may_have_any_value_that_is_no_place(
 
 @pytest.mark.parametrize("columns", [4, 5])
 def test_a_truncated_file_keeps_columns(table: np.ndarray, tmp_path: Path, columns: int) -> None:
-    content = row_bytes(table[:, :columns], "float32")
+    content = row_bytes(table[:, :columns])
     path = tmp_path / "a.bin"
     for removed in range(1, columns):
         path.write_bytes(content[: len(content) - removed * 4])
@@ -123,7 +123,7 @@ def test_rows_of_coordinates_are_asked_for_by_name(table: np.ndarray, tmp_path: 
     path = tmp_path / "a.bin"
     # The size may be a multiple of KITTI's or nuScenes' rows, or not.
     for left_out in reversed(range(5)):
-        path.write_bytes(row_bytes(table[left_out:, :3], "float32"))
+        write_rows(tmp_path, table[left_out:, :3])
         fails(lambda: read_cloud(path), path, "say --columns x,y,z if the rows have no more")
     cloud = read_cloud(path, parse_layout("x,y,z", None))
     np.testing.assert_array_equal(cloud.xyz, table[:, :3].astype("f4"))
@@ -131,7 +131,7 @@ def test_rows_of_coordinates_are_asked_for_by_name(table: np.ndarray, tmp_path: 
 
 def test_a_file_that_ends_in_a_row_is_called_truncated(table: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
-    data = row_bytes(table[:, :4], "float32")
+    data = row_bytes(table[:, :4])
     assert len(data) > 5000
     path.write_bytes(data[:-1])
     fails(lambda: read_cloud(path), path, f"{len(data) - 1} bytes", "copy the file again")
@@ -139,30 +139,26 @@ def test_a_file_that_ends_in_a_row_is_called_truncated(table: np.ndarray, tmp_pa
 
 def test_a_table_written_column_by_column_is_refused(table: np.ndarray, tmp_path: Path) -> None:
     """As the scans of Oxford RobotCar are: all x, then all y and so on."""
-    path = tmp_path / "a.bin"
-    path.write_bytes(row_bytes(table[:, :4].T, "float32"))
+    path = write_rows(tmp_path, table[:, :4].T)
     fails(lambda: read_cloud(path), path, "found values that fit neither")
 
 
 def test_rows_in_millimetres_are_read_by_named_columns(table: np.ndarray, tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
     rows = table[:, :4] * [1000, 1000, 1000, 1]
-    path.write_bytes(row_bytes(rows, "float32"))
+    path = write_rows(tmp_path, rows)
     fails(lambda: read_cloud(path), path, "--columns x,y,z,intensity if these are millimetres")
     cloud = read_cloud(path, parse_layout("x,y,z,intensity", None))
     np.testing.assert_allclose(cloud.xyz, rows[:, :3], rtol=1e-6)
 
 
 def test_rows_without_a_finite_number_are_named(table: np.ndarray, tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
-    path.write_bytes(row_bytes(np.full_like(table[:, :4], np.nan), "float32"))
+    path = write_rows(tmp_path, np.full_like(table[:, :4], np.nan))
     fails(lambda: read_cloud(path), path, "found no finite number")
 
 
 def test_the_user_s_columns_count(table: np.ndarray, tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
     for dtype in (None, "float64"):
-        path.write_bytes(row_bytes(table[:, [5, 4, 2, 1, 0, 3]], dtype or "float32"))
+        path = write_rows(tmp_path, table[:, [5, 4, 2, 1, 0, 3]], dtype or "float32")
         cloud = read_cloud(path, parse_layout("time,ring,z,y,x,intensity", dtype))
         np.testing.assert_array_equal(cloud.xyz, table[:, :3].astype(dtype or "float32"))
         np.testing.assert_array_equal(cloud.intensity, table[:, 3].astype(dtype or "float32"))
@@ -358,7 +354,7 @@ def test_patterns_of_any_folders_follow_links_once(table: np.ndarray, tmp_path: 
     elsewhere = tmp_path / "disk"
     for folder in (drives / "a", elsewhere / "deep"):
         folder.mkdir(parents=True)
-        (folder / "0.bin").write_bytes(row_bytes(table[:, :4], "float32"))
+        (folder / "0.bin").write_bytes(row_bytes(table[:, :4]))
     (drives / "b").symlink_to(elsewhere)
     for name in ("up", "again"):  # many ways around in circles
         (drives / "a" / name).symlink_to(drives)
@@ -385,7 +381,7 @@ def test_the_folders_of_a_pattern_are_read_once_for_each_any_folders(
         folder.mkdir()
         if has_circles:
             (folder / "up").symlink_to(tmp_path)
-    (folder / "0.bin").write_bytes(row_bytes(table[:, :4], "float32"))
+    (folder / "0.bin").write_bytes(row_bytes(table[:, :4]))
     counts = [0]
 
     def counted(read: Callable[..., Any]) -> Callable[..., Any]:

@@ -121,12 +121,7 @@ def test_any_number_is_a_street(tmp_path: Path) -> None:
     dataset = SimulatedStreets(tmp_path)
     records = dataset.records(["31", "000007", "7"])
     assert [record.sequence for record in records] == ["000007"] * 6 + ["000031"] * 6
-    assert [record.name for record in records[4:8]] == [
-        "000007/000004",
-        "000007/000005",
-        "000031/000000",
-        "000031/000001",
-    ]
+    assert [record.name for record in records[5:7]] == ["000007/000005", "000031/000000"]
 
 
 @pytest.mark.parametrize("name", ["-1", "first", "1000000"])
