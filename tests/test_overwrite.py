@@ -61,6 +61,9 @@ class Case:
 WEIGHTS = "--weights {world}/w.safetensors"
 SCORES = "--scores-a {world}/predictions --scores-b {world}/predictions"
 SCANS = f"predict {{world}}/pair {WEIGHTS} --out {{out}}"
+EVALUATE = "evaluate {world}/data --predictions {world}/predictions"
+FIRST = "sequences/08/predictions/000000.label"
+PAGE = b'<!doctype html>\n<meta name="generator" content="AMVNet">'
 LABELS = bytes(8)
 CASES = {
     "predict": Case(SCANS, "b.label", LABELS),
@@ -68,16 +71,8 @@ CASES = {
     "ply": Case(f"{SCANS} --format ply", "b.ply", PLY),
     "scores": Case(f"{SCANS} --scores", "a.npz", b"PK\3\4" + bytes(26) + b"rv.npy"),
     "uncertain": Case(f"{SCANS} --uncertain", "a.uncertain.npy", saved(np.zeros(3, bool))),
-    "dataset": Case(
-        f"predict {{world}}/data {WEIGHTS} --out {{out}}",
-        "sequences/08/predictions/000001.label",
-        LABELS,
-    ),
-    "fuse": Case(
-        f"fuse {{world}}/data {SCORES} --out {{out}}",
-        "sequences/08/predictions/000000.label",
-        LABELS,
-    ),
+    "dataset": Case(f"predict {{world}}/data {WEIGHTS} --out {{out}}", FIRST, LABELS),
+    "fuse": Case(f"fuse {{world}}/data {SCORES} --out {{out}}", FIRST, LABELS),
     "rank": Case(
         f"rank {{world}}/data {WEIGHTS} --out {{out}}/r.csv --split all",
         "r.csv",
@@ -88,21 +83,9 @@ CASES = {
         "e.zip",
         b"PK\3\4" + bytes(26) + b"sequences/PK",
     ),
-    "view": Case(
-        f"view {{world}}/data {WEIGHTS} --html {{out}}/page.html",
-        "page.html",
-        b'<!doctype html>\n<meta name="generator" content="AMVNet">',
-    ),
-    "figures": Case(
-        "evaluate {world}/data --predictions {world}/predictions --json {out}/m.json",
-        "m.json",
-        b'{"dataset": "mine"}',
-    ),
-    "pictures": Case(
-        "evaluate {world}/data --predictions {world}/predictions --pictures {out}",
-        "08_000000.png",
-        PNG,
-    ),
+    "view": Case(f"view {{world}}/data {WEIGHTS} --html {{out}}/page.html", "page.html", PAGE),
+    "figures": Case(f"{EVALUATE} --json {{out}}/m.json", "m.json", b'{"dataset": "mine"}'),
+    "pictures": Case(f"{EVALUATE} --pictures {{out}}", "08_000000.png", PNG),
     "bench": Case(
         f"bench {WEIGHTS} --runs 1 --scan {{world}}/pair/a.bin --json {{out}}/b.json",
         "b.json",
@@ -161,12 +144,12 @@ READ = {
     "weights": (f"{SCANS} --overwrite", "b.label", "w.safetensors"),
     "true labels": (
         f"predict {{world}}/data {WEIGHTS} --out {{out}} --overwrite",
-        "sequences/08/predictions/000000.label",
+        FIRST,
         "data/sequences/08/labels/000001.label",
     ),
     "scores": (
         f"fuse {{world}}/data {SCORES} --out {{out}} --overwrite",
-        "sequences/08/predictions/000000.label",
+        FIRST,
         "predictions/sequences/08/predictions/000001.npz",
     ),
     "view": ("view {world}/pair/a.bin --html {out}/p.html --overwrite", "p.html", "pair/a.bin"),

@@ -280,9 +280,8 @@ def test_wrong_options_of_fuse_are_one_line(world: Path, tmp_path: Path) -> None
 @pytest.mark.full
 def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) -> None:
     arguments = ("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path)
-    first = ("--scores-a", world / "predictions")
-    second = ("--scores-b", world / "predictions")
-    cases = {"--stage head": (*first, *second), "--scores-b": (*first, "--stage", "head")}
+    both = score_options(world)
+    cases = {"--stage head": both, "--scores-b": [*both[:2], "--stage", "head"]}
     for word, options in cases.items():
         refused((*arguments, *options), word)
     assert not files(tmp_path)
@@ -293,8 +292,7 @@ def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) ->
 
 def train_head_arguments(world: Path, out: Path) -> list[Any]:
     recipe = world / "recipe.yaml"
-    arguments = ["train", recipe, "--data", world / "data", "--stage", "head", "--out", out]
-    return arguments
+    return ["train", recipe, "--data", world / "data", "--stage", "head", "--out", out]
 
 
 def score_options(world: Path) -> list[Any]:
@@ -353,8 +351,7 @@ def test_the_run_resumes_with_its_own_scores_only(world: Path, head: Path) -> No
     arguments = [*train_head_arguments(world, head), "--resume"]
     assert run_cli(*arguments, *score_options(world)) == (0, "")
 
-    scores = ["--scores-a", world / "predictions", "--scores-b", world / "predictions"]
-    refused((*arguments, *scores, "--logits", "a"), "scores")
+    refused((*arguments, *score_options(world), "--logits", "a"), "scores")
 
 
 @pytest.mark.parametrize("ending", ["npy", "npz"])

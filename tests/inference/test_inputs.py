@@ -83,6 +83,7 @@ def test_if_first_scans_differ_each_is_measured(tmp_path: Path, first: str, seco
     assert len(lines) == 2  # one of each sensor
     for line in lines:
         assert "has scans of other sensors, so that each is measured alone" in line
+        assert "assumed intensity 0 to 1, sensor " in line
 
 
 def test_a_later_scan_of_another_sensor_is_measured_alone_and_told(tmp_path: Path) -> None:
@@ -159,16 +160,6 @@ def test_a_doubtful_scan_is_named_and_not_the_mean_of_its_folder() -> None:
         lines = said([of_folder("good", 0.1), of_folder("bad", 0.9, points)])
         assert "warning: bad: do not rely on these labels: 90.0%" in lines[1]
         assert lines[2:] == [f"warning: {ADVICE}"]
-
-
-def test_what_is_assumed_of_each_sensor_in_a_folder_is_said_once(tmp_path: Path) -> None:
-    for seed, sensor in enumerate(["vlp16", "os1-64"] * 4):
-        write(tmp_path / "both", f"s{seed}", sensor, 0.9 if sensor == "vlp16" else 1.4, seed)
-    _, _, lines = normalised(tmp_path / "both")
-    assumed = [line for line in lines if "assumed" in line]
-    assert len(assumed) == 2
-    assert "-15" in assumed[0]
-    assert "-22" in assumed[1] or "-23" in assumed[1]
 
 
 def test_one_doubtful_recording_is_one_line() -> None:

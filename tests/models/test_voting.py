@@ -121,15 +121,6 @@ def test_a_vote_equals_a_loop_over_the_points(
     assert 0.05 < changed < 0.95  # else the test would not say much
 
 
-def test_a_hidden_point_gets_the_label_of_points_at_its_own_distance() -> None:
-    wall = [at_pixel(row, column, 20) for row in (3, 4, 5) for column in (5, 6, 7)]
-    pole = at_pixel(4, 6, 5)
-    # The pole hides the middle of the wall, which gets the pole's label from the range view.
-    f = scores_of([2, 2, 2, 2, 1, 2, 2, 2, 2, 1])
-    voted = vote(batch_of([*wall, pole]), f).argmax(dim=1)
-    assert voted.tolist() == [2] * 9 + [1]
-
-
 def test_a_scan_without_occlusion_keeps_labels_that_change_with_the_distance() -> None:
     rng = np.random.default_rng(0)
     labels = rng.integers(0, K, (VIEW.height, VIEW.width))
@@ -160,24 +151,6 @@ def test_of_equal_votes_those_of_least_difference_count(monkeypatch: pytest.Monk
     more = [*row, at_pixel(4, 8, 10.5)]
     monkeypatch.setattr(voting, "NEIGHBOURS", 4)
     assert vote(batch_of(more), scores_of([1, 3, 2, 1]))[1].argmax() == 1
-
-
-def test_the_window_goes_around_the_sensor() -> None:
-    rng = np.random.default_rng(1)
-    points = []
-    for _ in range(300):
-        row = int(rng.integers(VIEW.height))
-        column = rng.integers(VIEW.width) + rng.uniform(-0.3, 0.3)
-        points.append(at_pixel(row, column, rng.uniform(5, 9)))
-    batch = batch_of(points)
-    f = torch.rand(len(points), K, generator=torch.Generator().manual_seed(2))
-
-    expected = vote(batch, f)
-    for turns in range(4):
-        turned = batch.points.numpy().copy()
-        for _ in range(turns):
-            turned[:, :2] = np.column_stack([-turned[:, 1], turned[:, 0]])
-        assert torch.allclose(vote(PointBatch.of([Scan(turned)]), f), expected)
 
 
 def test_a_point_exactly_at_the_cutoff_votes(monkeypatch: pytest.MonkeyPatch) -> None:

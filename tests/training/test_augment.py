@@ -101,32 +101,19 @@ def test_jitter_is_noise_of_its_deviation_on_each_coordinate(random_scan: Random
     assert abs(np.corrcoef(noise.T) - np.eye(3)).max() < 0.1
 
 
-def test_with_everything_off_the_scan_stays_the_same(random_scan: RandomScan) -> None:
-    scan = random_scan(50)
-    assert np.array_equal(augmented(scan, OFF).points, scan.points)
-
-
-def test_labels_intensity_ring_and_name_stay_by_default(random_scan: RandomScan) -> None:
+def test_labels_intensity_ring_name_and_lost_returns_stay(random_scan: RandomScan) -> None:
     scan = replace(random_scan(50), name="somewhere")
-    changed = augmented(scan, AugmentConfig())
+    scan.points[7, :3] = math.nan
+    before = scan.points.copy()
+    np.testing.assert_array_equal(augmented(scan, OFF).points, before)
+    changed = augmented(scan, AugmentConfig(flip=1.0))
+    np.testing.assert_array_equal(scan.points, before)  # the given scan, too
+    assert np.flatnonzero(~changed.valid).tolist() == [7]
     assert np.array_equal(changed.points[:, 3], scan.points[:, 3])
     assert changed.labels is scan.labels
     assert changed.ring is scan.ring
     assert changed.name == "somewhere"
     assert changed.points.dtype == np.float32
-
-
-def test_the_original_scan_is_not_modified(random_scan: RandomScan) -> None:
-    scan = random_scan(50)
-    before = scan.points.copy()
-    augmented(scan, AugmentConfig(flip=1.0))
-    assert np.array_equal(scan.points, before)
-
-
-def test_lost_returns_stay_lost_and_keep_their_index(random_scan: RandomScan) -> None:
-    scan = random_scan(50)
-    scan.points[7, 0] = math.nan
-    assert np.flatnonzero(~augmented(scan, AugmentConfig()).valid).tolist() == [7]
 
 
 def test_points_are_dropped_together_with_their_labels_and_rings(random_scan: RandomScan) -> None:
@@ -188,6 +175,8 @@ def test_some_scans_have_no_intensity(random_scan: RandomScan) -> None:
 
     assert set(np.round(sums, 3)) == {0, np.round(scan.points[:, 3].sum(), 3)}
     assert 15 < sums.count(0) < 45
+    config = replace(OFF, no_intensity=1.0, intensity_offset=0.5)
+    assert not augmented(scan, config).points[:, 3].any()
 
 
 def test_a_mixed_scan_has_one_sector_of_another_scan(random_scan: RandomScan) -> None:
@@ -284,12 +273,6 @@ def test_objects_are_pasted_at_their_place_turned_once_or_twice(random_scan: Ran
     assert copies == {1, 2}
 
 
-def test_without_objects_nothing_is_pasted(random_scan: RandomScan) -> None:
-    scan = random_scan(50, 1)
-    pasted = paste(scan, random_scan(50, 2), [], np.random.default_rng(0))
-    assert np.array_equal(pasted.points, scan.points)
-
-
 def test_tilting_keeps_distances_and_the_vertical_within_limits(random_scan: RandomScan) -> None:
     scan = random_scan(50)
     scan.points[0] = (0, 0, 10, 0.5)
@@ -365,11 +348,6 @@ def test_every_laser_is_dimmed_by_one_factor_of_its_own(random_scan: RandomScan)
 
     scan.points[:, 3] = 0.9
     assert augmented(scan, replace(OFF, laser_gain=0.4)).points[:, 3].max() == 1
-
-
-def test_a_scan_without_intensity_gets_none(random_scan: RandomScan) -> None:
-    config = replace(OFF, no_intensity=1.0, intensity_offset=0.5)
-    assert not augmented(random_scan(50), config).points[:, 3].any()
 
 
 def test_lasers_without_rings_are_bins_of_elevation(random_scan: RandomScan) -> None:
@@ -491,7 +469,7 @@ def from_other_scan(mixed: Scan, scan: Scan, other: Scan) -> np.ndarray:
     return np.array(is_foreign)
 
 
-def test_lost_returns_are_not_pasted(random_scan: RandomScan) -> None:
+def test_lost_returns_and_other_classes_are_not_pasted(random_scan: RandomScan) -> None:
     scan = random_scan(50, seed=0)
     other = random_scan(60, seed=1)
     points = other.points.copy()
@@ -500,3 +478,5 @@ def test_lost_returns_are_not_pasted(random_scan: RandomScan) -> None:
     pasted = paste(scan, Scan(points, labels, other.ring), [1], np.random.default_rng(0))
     assert pasted.valid[len(scan) :].all()
     assert (len(pasted) - len(scan)) % 40 == 0
+    nothing = paste(scan, other, [], np.random.default_rng(0))
+    assert np.array_equal(nothing.points, scan.points)

@@ -48,6 +48,14 @@ from fixtures.tiny import (
 )
 
 
+def relabel_cars(data: Path) -> None:
+    """Call the cars of a dataset buildings, so that it lacks cars."""
+    for path in data.rglob("*.label"):
+        raw = np.fromfile(path, np.uint32)
+        raw[raw == CAR] = BUILDING
+        raw.tofile(path)
+
+
 def mixed(tmp_path: Path, share: float, first: int = 4, second: int = 14) -> TrainingData:
     a = open_dataset(str(make_streets(tmp_path / "a", ("00", "08"), first)))
     b = open_dataset(str(make_streets(tmp_path / "b", ("00",), second)))
@@ -98,11 +106,7 @@ def test_points_keep_their_dataset_as_their_source_when_scans_are_mixed(tmp_path
 
 
 def test_the_check_finds_others_classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    make_streets(tmp_path / "a", ("00", "08"), 4)
-    for path in (tmp_path / "a").rglob("*.label"):
-        raw = np.fromfile(path, np.uint32)
-        raw[raw == CAR] = BUILDING
-        raw.tofile(path)
+    relabel_cars(make_streets(tmp_path / "a", ("00", "08"), 4))
     a = open_dataset(str(tmp_path / "a"))
     b = open_dataset(str(make_streets(tmp_path / "b", ("00",), 14)))
     lines: list[str] = []
@@ -302,11 +306,7 @@ def test_the_mean_with_initial_weights_needs_their_classes() -> None:
 def test_a_training_distils_what_one_of_its_datasets_lacks_and_says_so(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    make_streets(tmp_path / "b", ("00",), 3)
-    for path in (tmp_path / "b").rglob("*.label"):
-        raw = np.fromfile(path, np.uint32)
-        raw[raw == CAR] = BUILDING
-        raw.tofile(path)
+    relabel_cars(make_streets(tmp_path / "b", ("00",), 3))
 
     trained = []
     for name, distill in (("with", 5), ("without", 0)):

@@ -54,14 +54,7 @@ from fixtures.tiny import (
     write_recipe,
 )
 
-NO_AUGMENTATION = (
-    "--training.augment.yaw",
-    0,
-    "--training.augment.scale",
-    0,
-    "--training.augment.flip",
-    0,
-)
+NO_AUGMENTATION = [f"--training.augment.{name}=0" for name in ("yaw", "scale", "flip")]
 PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 STAGES = pytest.mark.parametrize("stage", PART_OF)
 
@@ -86,6 +79,14 @@ def differing(a: Weights, b: Weights) -> set[str]:
         if not torch.equal(tensor, b.tensors[name]):
             parts.add(name.split(".")[0])
     return parts
+
+
+def scored(world: Path, folder: Path, weights: Path, *options: object) -> dict[str, Any]:
+    """Return the figures of `evaluate`, which writes them into a folder."""
+    figures = folder / "figures.json"
+    command = ("evaluate", world / "data", "--weights", weights, "--json", figures)
+    succeed(*command, *options)
+    return dict(json.loads(figures.read_text()))
 
 
 def column(run: Path, stage: str, name: str) -> list[float]:
@@ -114,16 +115,24 @@ def run(world: Path) -> Path:
 
 
 @STAGES
-def test_a_stage_writes_its_best_and_last_weights_and_its_curves(run: Path, stage: str) -> None:
+def test_a_stage_writes_its_curves_and_the_weights_of_the_highest_miou(
+    run: Path, stage: str
+) -> None:
     names = files(run / stage)
     assert {"best.safetensors", "last.safetensors"} <= names
     assert any(name.startswith("events.out.tfevents") for name in names)
-    assert len(column(run, stage, "val/miou")) == (2 if stage == "head" else 3)
+    values = column(run, stage, "val/miou")
+    assert len(values) == (2 if stage == "head" else 3)
+    metrics = load(run / stage / "best.safetensors").metrics[PART_OF[stage]]
+    assert metrics["epoch"] == int(np.argmax(values))
+    assert metrics["val/miou"] == pytest.approx(max(values), abs=1e-6)
 
 
 def test_an_earlier_run_is_refused_before_the_data_are_read(run: Path) -> None:
+    before = (run / "recipe.yaml").read_bytes()
     error = refusal("train", "semantickitti-compact", "--data", run / "missing.yaml", "--out", run)
     assert "expected no earlier run" in error
+    assert (run / "recipe.yaml").read_bytes() == before
 
 
 @STAGES
@@ -144,14 +153,6 @@ def test_the_picture_of_a_run_shows_what_it_logged(run: Path, stage: str) -> Non
 def test_names_of_classes_are_no_formulas(tmp_path: Path) -> None:
     curves = Curves([(1.0, 0.5)], [0.5], {"$a_b$": 0.5, "$": 0.2})
     assert draw_curves({"rv": curves}, tmp_path / "curves.png").is_file()
-
-
-@STAGES
-def test_the_best_weights_are_those_of_the_highest_validation_miou(run: Path, stage: str) -> None:
-    values = column(run, stage, "val/miou")
-    metrics = load(run / stage / "best.safetensors").metrics[PART_OF[stage]]
-    assert metrics["epoch"] == int(np.argmax(values))
-    assert metrics["val/miou"] == pytest.approx(max(values), abs=1e-6)
 
 
 def test_the_class_counts_of_a_run_are_those_of_its_training_scans(world: Path, run: Path) -> None:
@@ -211,10 +212,6 @@ def test_the_weights_describe_their_training(run: Path) -> None:
     assert weights.expects.as_is
     assert weights.expects.intensity is not None
     assert weights.expects.intensity.are_fractions
-
-
-def test_a_run_leaves_no_temporary_files(run: Path) -> None:
-    assert not [name for name in files(run) if ".part" in name]
 
 
 def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: Path) -> None:
@@ -292,6 +289,7 @@ def test_an_interrupted_run_resumes_to_the_same_weights(
     for name in ("best", "last"):
         path = f"{stage}/{name}.safetensors"
         assert not differing(load(tmp_path / "run" / path), load(run / path))
+    assert len(column(tmp_path / "run", stage, "val/miou")) == len(column(run, stage, "val/miou"))
 
 
 @pytest.mark.full
@@ -309,11 +307,8 @@ def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
     accuracies = column(tmp_path / "whole", "rv", "val/acc")
     assert accuracies != column(run, "rv", "val/acc")
 
-    report = tmp_path / "report.json"
-    options_of_report = ("--weights", last, "--methods", "rv", "--json", report)
-    assert run_cli("evaluate", world / "data", *options_of_report)[0] == 0
-    accuracy = json.loads(report.read_text())["methods"]["rv"]["accuracy"]
-    assert accuracy == pytest.approx(accuracies[-1], abs=2e-3)
+    figures = scored(world, tmp_path, last, "--methods", "rv")["methods"]["rv"]
+    assert figures["accuracy"] == pytest.approx(accuracies[-1], abs=2e-3)
 
     train_interrupted("rv", 1, world, tmp_path / "cut", *options)
     assert not differing(train(world, tmp_path / "cut", *options, "--resume"), whole)
@@ -405,12 +400,9 @@ def test_tuning_weights_of_matched_intensities_matches_the_other_scans_too(
     assert tuned.expects.intensity == matched.expects.intensity
 
     # In training, the network is validated on what it gets in a prediction.
-    report = tmp_path / "report.json"
-    last = tmp_path / "run/weights.safetensors"
-    options_of_report = ("--weights", last, "--methods", "rv", "--json", report)
-    assert run_cli("evaluate", world / "data", *options_of_report)[0] == 0
-    accuracy = json.loads(report.read_text())["methods"]["rv"]["accuracy"]
-    assert accuracy == pytest.approx(column(tmp_path / "run", "rv", "val/acc")[-1], abs=1e-4)
+    figures = scored(world, tmp_path, tmp_path / "run", "--methods", "rv")["methods"]["rv"]
+    accuracies = column(tmp_path / "run", "rv", "val/acc")
+    assert figures["accuracy"] == pytest.approx(accuracies[-1], abs=1e-4)
 
 
 @pytest.mark.full
@@ -424,19 +416,6 @@ def test_reading_in_workers_changes_nothing_at_all(world: Path, run: Path, tmp_p
     train(world, tmp_path / "run", *options, "--resume")
     resumed = load(tmp_path / "run/rv/last.safetensors")
     assert not differing(resumed, load(run / "rv/last.safetensors"))
-
-
-@pytest.mark.full
-def test_a_resumed_run_keeps_the_curves_of_its_earlier_epochs(world: Path, tmp_path: Path) -> None:
-    train_interrupted("rv", 2, world, tmp_path / "run", "--stage", "rv")
-    train(world, tmp_path / "run", "--stage", "rv", "--resume")
-    assert len(column(tmp_path / "run", "rv", "val/miou")) == 3
-
-
-def test_a_refused_run_leaves_the_recipe_of_the_existing_run(world: Path, run: Path) -> None:
-    before = (run / "recipe.yaml").read_bytes()
-    refusal(*train_arguments(world, run), "--training.seed", 9)
-    assert (run / "recipe.yaml").read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -470,7 +449,8 @@ def test_a_broken_label_file_is_one_line_from_a_worker_too(world: Path, tmp_path
     )
 
 
-def test_the_points_of_the_head_are_removed_after_its_training(run: Path) -> None:
+def test_a_run_leaves_no_temporary_files_and_no_points_of_its_head(run: Path) -> None:
+    assert not [name for name in files(run) if ".part" in name]
     assert not (run / "head/train").exists()
     assert not (run / "head/val").exists()
 
@@ -623,10 +603,7 @@ def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
     assert weights.usual_uncertain == 0
 
     # The figure of the head is AMVNet's: the ensemble's wherever the networks agree.
-    figures = tmp_path / "figures.json"
-    evaluate = ("evaluate", world / "data", "--weights", tmp_path / "run", "--json", figures)
-    assert run_cli(*evaluate)[0] == 0
-    expected = json.loads(figures.read_text())["methods"]["amvnet"]["miou"]
+    expected = scored(world, tmp_path, tmp_path / "run")["methods"]["amvnet"]["miou"]
     mious = column(tmp_path / "run", "head", "val/miou")
     assert mious[-1] == pytest.approx(expected, abs=1e-3)
 
@@ -699,10 +676,8 @@ def test_a_run_of_several_calls_records_what_each_trained_on(world: Path, tmp_pa
     train(world, tmp_path, "--stage", "bev", "--train-sequences", "01", *val)
 
     records = yaml.safe_load((tmp_path / "run.yaml").read_text())
-    assert {name: record["train"] for name, record in records.items()} == {
-        "rv": ["00"],
-        "bev": ["01"],
-    }
+    trained = {name: record["train"] for name, record in records.items()}
+    assert trained == {"rv": ["00"], "bev": ["01"]}
     assert records["rv"]["val"] == ["08"]
     assert records["rv"]["versions"]["torch"] == torch.__version__
 
@@ -825,17 +800,14 @@ def test_a_run_that_fails_is_one_line_and_keeps_its_stages(world: Path, tmp_path
 @pytest.mark.parametrize("stage", ["bev", "rv"])
 def test_a_baseline_is_trained_and_evaluated_alone(world: Path, tmp_path: Path, stage: str) -> None:
     recipe = write_recipe(tmp_path / "recipe.yaml", "semantickitti-compact")
-    data = world / "data"
     run = tmp_path / "run"
     options = ("--stage", stage, "--model.range_net.gru", "false")
-    assert run_cli("train", recipe, "--data", data, "--out", run, *options) == (0, "")
+    succeed("train", recipe, "--data", world / "data", "--out", run, *options)
     weights = load(run)
     assert weights.parts == (PART_OF[stage],)
     assert not [name for name in weights.tensors if "gru" in name]
 
-    results = tmp_path / "metrics.json"
-    assert run_cli("evaluate", data, "--weights", run, "--json", results) == (0, "")
-    assert list(json.loads(results.read_text())["methods"]) == [stage]
+    assert list(scored(world, tmp_path, run)["methods"]) == [stage]
 
 
 @pytest.mark.full
@@ -864,10 +836,7 @@ def test_a_step_that_does_not_fit_into_the_memory_says_what_to_set(
 
 
 def test_the_uncertain_share_is_the_networks_own(world: Path, run: Path, tmp_path: Path) -> None:
-    results = tmp_path / "metrics.json"
-    assert run_cli("evaluate", world / "data", "--weights", run, "--json", results) == (0, "")
-    share = json.loads(results.read_text())["uncertain_fraction"]
-
+    share = scored(world, tmp_path, run)["uncertain_fraction"]
     # The evaluation counts unlabelled points, too: two in a hundred.
     assert column(run, "head", "val/uncertain")[0] == pytest.approx(share, abs=0.02)
 

@@ -1,6 +1,6 @@
 // The point head (section 3.3 of the paper) decides disputed points by the scores of both networks around them.
 
-const PART = 2048;  // the number of disputed points that are classified at a time, which limits the memory
+const HEAD_BATCH = 2048;  // the number of disputed points that are classified at a time, which limits the memory
 
 /**
  * Return the head's probabilities (u K) of disputed points (u), given the points (4 p), both networks' probabilities
@@ -13,8 +13,8 @@ export async function classify(networks, { points, f, g, disputed, neighbours })
   const fill = (target, start, i) =>
     [f.subarray(i * k, (i + 1) * k), g.subarray(i * k, (i + 1) * k), points.subarray(4 * i, 4 * i + 4)]
       .forEach((values, part) => target.set(values, start + part * k));
-  for (let first = 0; first < disputed.length; first += PART) {
-    const part = disputed.subarray(first, first + PART);
+  for (let first = 0; first < disputed.length; first += HEAD_BATCH) {
+    const part = disputed.subarray(first, first + HEAD_BATCH);
     const point = new Float32Array(part.length * width), rows = new Float32Array(part.length * n * width);
     part.forEach((i, row) => {
       for (let rank = 0; rank < n; rank++) {

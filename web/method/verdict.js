@@ -1,6 +1,6 @@
 // Judge how sure the labels of a scan are, as the command `predict` does.
 
-const FEW = 0.01;  // the share below which labels are not doubtful
+const FEW_UNCERTAIN = 0.01;  // the share below which labels are not doubtful
 const SMALLEST = 1e-12;  // the probability whose logarithm stands for that of 0
 
 /**
@@ -12,7 +12,7 @@ export function verdictOf({ scores, uncertain }, { method, doubt }, k) {
   if (!doubt) return null;
   const share = uncertain ? meanOf(uncertain) : k * meanOf(scores[method], (p) => -p * Math.log(Math.max(p, SMALLEST))) / Math.log(Math.max(k, 2));
   const { usual, unusual_odds: odds } = doubt, percent = (value) => `${(100 * value).toFixed(1)}%`;
-  const isDoubtful = share >= FEW && share * (1 - usual) > odds * usual * (1 - share);
+  const isDoubtful = share >= FEW_UNCERTAIN && share * (1 - usual) > odds * usual * (1 - share);
   const what = uncertain ? "of the points are uncertain" : "is the mean entropy of the network";
   const text = `${percent(share)} ${what} (usual: ${percent(usual)})`;
   return { isDoubtful, text: isDoubtful ? `do not rely on these labels: ${text}` : text };

@@ -9,7 +9,7 @@ import { counted, InputError, quoted } from "../errors.js";
 
 // The largest number of points of a scan. A page has less memory than a program: `amvnet predict` reads ten million points.
 export const MAX_POINTS = 1_000_000;
-const MAX_MISSING = 0.5;  // the share of missing intensities above which a scan counts as one without intensities
+const MAX_MISSING_SHARE = 0.5;  // the share of missing intensities above which a scan counts as one without intensities
 const MAX_RINGS = 256;  // largest number of lasers; a column with larger values does not hold ring indices
 
 // The possible names of each column; the first name that a file has is read.
@@ -87,6 +87,6 @@ export function isPlaced(xyz, start) {
 export function measuredIntensities({ xyz, intensity }) {
   if (!intensity) return { measured: new Float64Array(0), placed: 0 };
   const values = Float64Array.from(intensity.values).filter((_, i) => isPlaced(xyz, 3 * i)), placed = values.length;
-  const measured = values.filter(Number.isFinite).sort(), areMissing = placed - measured.length > MAX_MISSING * placed;
+  const measured = values.filter(Number.isFinite).sort(), areMissing = placed - measured.length > MAX_MISSING_SHARE * placed;
   return { measured: areMissing ? new Float64Array(0) : measured, placed };
 }

@@ -4,7 +4,7 @@
 
 import { InputError } from "../errors.js";
 
-const LONGEST_HEADER = 65_536;  // the longest header of a file, bytes
+const HEADER = 65_536;  // the longest header of a file, bytes
 
 // The types: the size in bytes, the typed array that holds values, and the method of a DataView that reads a value.
 export const TYPES = {
@@ -83,7 +83,7 @@ export class Header {
   /** Return the words of the next line. */
   words() {
     const end = this.bytes.indexOf(10, this.position), next = end < 0 ? this.bytes.length : end + 1;
-    if (this.position >= this.bytes.length || next > LONGEST_HEADER) {
+    if (this.position >= this.bytes.length || next > HEADER) {
       throw new InputError(
         `${this.name}: expected the header of ${this.kind}, found no ${this.end}; write the file again`,
       );

@@ -10,7 +10,7 @@ const FEWEST_BYTES = 4800;  // the least size of a file whose values can show th
 const ADVICE = "save it as a .pcd or .ply file, or label it with amvnet predict and --columns";
 
 // These limits tell coordinates and intensities from other columns, and float32 from other types.
-const LARGEST_INTENSITY = 65535;  // the largest intensity that any sensor writes
+const MAX_INTENSITY = 65535;  // the largest intensity that any sensor writes
 const NEAR = 500;  // the limit of coordinates in usual scans, metres
 const NO_INTENSITY = -1;  // the intensity that some tools write for a lost return; no other is negative
 const USUAL_SHARE = 0.999;  // the least share of points within these limits; the others are outliers
@@ -93,5 +93,5 @@ function isKitti([x, y, z, intensity]) {
 
 /** Return whether a value can be an intensity, also of a lost point. */
 function isIntensity(value) {
-  return (value >= 0 && value <= LARGEST_INTENSITY) || value === NO_INTENSITY || !Number.isFinite(value);
+  return (value >= 0 && value <= MAX_INTENSITY) || value === NO_INTENSITY || !Number.isFinite(value);
 }

@@ -1,7 +1,7 @@
 // Find the frame of a scan file: its unit, its axes, its tilt, and the height of the sensor.
 
 import { InputError } from "../errors.js";
-import { findGround, NEAREST } from "./ground.js";
+import { findGround, MIN_DISTANCE } from "./ground.js";
 import { quantilesOf } from "./statistics.js";
 
 // Matrices that turn a file's x, y, z into forward, left, up.
@@ -16,21 +16,21 @@ export const UNITS = { m: 1, mm: 0.001 };  // the length of each unit, metres
 
 // The median distance of the points tells the unit. In metres, it is 2 to 40 with all sensors. Between the two limits,
 // the unit may be centimetres or millimetres.
-const FARTHEST_MEDIAN = 200;  // the largest median distance of a scan in metres
-const LEAST_MILLIMETRES = 4000;  // the least median distance of a scan in millimetres
+const MAX_METRES_MEDIAN = 200;  // the largest median distance of a scan in metres
+const MIN_MILLIMETRES_MEDIAN = 4000;  // the least median distance of a scan in millimetres
 // The largest ratio of near distances (quantile 0.05) to far ones (0.95) of a scan whose origin is near the sensor.
-const AROUND = 0.5;
+const AROUND_SHARE = 0.5;
 
 const SAME_TILT = 3.5;  // the largest tilt that is kept, degrees; in the datasets, roads slope by up to 3.1
 const SAME_HEIGHT = 0.15;  // the largest difference of height that is kept, metres; the training varies it as much
-const LOWEST = 0.3;  // the least height of a sensor, metres; a lower origin lies on the ground
+const ON_GROUND_HEIGHT = 0.3;  // the least height of a sensor, metres; a lower origin lies on the ground
 // Below this height, the lasers tell whether the origin is a low sensor or the foot of a vehicle.
-const LOW = 0.6;
-const STANDING = 0.3;  // the least height over the ground of points that tell, metres
+const LOW_HEIGHT = 0.6;
+const STANDING_HEIGHT = 0.3;  // the least height over the ground of points that tell, metres
 const RAISED = Array.from({ length: 13 }, (_, i) => 0.6 + 0.15 * i);  // heights over the origin to seek sensors at, metres
 const LESS_SHARP = 0.75;  // the largest ratio of the sharpness of the lasers from the origin to that from above, if it is apart
-const SECTORS = 60, BINS = 3600, TOGETHER = 20;  // the bins that tell whether points lie on lasers
-const HIGHEST = 4.5;  // the largest height of a sensor on a vehicle, metres; beyond it, the unit may be feet
+const SHARP_SECTORS = 60, SHARP_BINS = 3600, BINS_TOGETHER = 20;  // the bins that tell whether points lie on lasers
+const MAX_SENSOR_HEIGHT = 4.5;  // the largest height of a sensor on a vehicle, metres; beyond it, the unit may be feet
 
 const degrees = (radians) => (radians * 180) / Math.PI;
 
@@ -59,12 +59,12 @@ export function findFrame(xyz, name) {
     const up = again ? [0, 1, 2].map((axis) => dot([0, 1, 2].map((row) => turn[row][axis]), again.up)) : ground.up;
     [frame.pitch, frame.roll] = levelling(up);
     frame.height = (again ?? ground).height;
-  } else if (frame.height >= LOWEST && frame.height < LOW) {
+  } else if (frame.height >= ON_GROUND_HEIGHT && frame.height < LOW_HEIGHT) {
     frame.isApart = isApart(level, ground);
   }
-  if (frame.height > HIGHEST) {
+  if (frame.height > MAX_SENSOR_HEIGHT) {
     throw new InputError(
-      `${name}: expected a sensor at most ${HIGHEST} m over the ground, found ${frame.height.toFixed(1)}; ` +
+      `${name}: expected a sensor at most ${MAX_SENSOR_HEIGHT} m over the ground, found ${frame.height.toFixed(1)}; ` +
       "label it with amvnet predict and --unit ft if these are feet, else --height",
     );
   }
@@ -82,29 +82,29 @@ export function toLevel(xyz, { unit, axes, pitch, roll }) {
 
 /** Return whether the origin of the coordinates lies on or below the ground. */
 export function isOnGround(frame) {
-  return frame.height !== null && frame.height < (frame.isApart ? LOW : LOWEST);
+  return frame.height !== null && frame.height < (frame.isApart ? LOW_HEIGHT : ON_GROUND_HEIGHT);
 }
 
 /** Return whether the lasers of points (3 n) that stand on the ground are clearly sharper from above the origin. */
 function isApart(level, { up, height }) {
-  const isStanding = (i) => dot(level.subarray(i, i + 3), up) + height * up[2] > STANDING;
+  const isStanding = (i) => dot(level.subarray(i, i + 3), up) + height * up[2] > STANDING_HEIGHT;
   const standing = level.filter((_, place) => isStanding(place - (place % 3)));
   return sharpnessOf(standing, 0) < LESS_SHARP * Math.max(...RAISED.map((rise) => sharpnessOf(standing, rise)));
 }
 
 /** Return how much points (3 n), seen from a height over the origin, gather at the same elevations, as a laser's do. */
 function sharpnessOf(xyz, rise) {
-  const counts = new Float64Array(SECTORS * BINS);
+  const counts = new Float64Array(SHARP_SECTORS * SHARP_BINS);
   for (let i = 0; i < xyz.length; i += 3) {
     const radius = Math.hypot(xyz[i], xyz[i + 1]);
-    if (!(radius > NEAREST)) continue;
-    const sector = Math.floor((Math.atan2(xyz[i + 1], xyz[i]) / (2 * Math.PI) + 0.5) * SECTORS) % SECTORS;
-    const bin = Math.floor((degrees(Math.atan2(xyz[i + 2] - rise, radius)) / 180 + 0.5) * BINS);
-    counts[sector * BINS + Math.min(bin, BINS - 1)]++;
+    if (!(radius > MIN_DISTANCE)) continue;
+    const sector = Math.floor((Math.atan2(xyz[i + 1], xyz[i]) / (2 * Math.PI) + 0.5) * SHARP_SECTORS) % SHARP_SECTORS;
+    const bin = Math.floor((degrees(Math.atan2(xyz[i + 2] - rise, radius)) / 180 + 0.5) * SHARP_BINS);
+    counts[sector * SHARP_BINS + Math.min(bin, SHARP_BINS - 1)]++;
   }
   let pairs = 0, pairsTogether = 0;
-  for (let i = 0; i < counts.length; i += TOGETHER) {
-    const part = counts.subarray(i, i + TOGETHER), together = part.reduce((sum, count) => sum + count, 0);
+  for (let i = 0; i < counts.length; i += BINS_TOGETHER) {
+    const part = counts.subarray(i, i + BINS_TOGETHER), together = part.reduce((sum, count) => sum + count, 0);
     pairs += part.reduce((sum, count) => sum + count * (count - 1), 0);
     pairsTogether += together * (together - 1);
   }
@@ -170,8 +170,8 @@ function unitOf(xyz, name) {
   const [near, median, far] = quantilesOf(distances.sort(), [0.05, 0.5, 0.95]);
 
   // Points far from the origin are map coordinates, which `normalise` refuses.
-  if (!(median > FARTHEST_MEDIAN) || near > AROUND * far) return "m";
-  if (median > LEAST_MILLIMETRES) return "mm";
+  if (!(median > MAX_METRES_MEDIAN) || near > AROUND_SHARE * far) return "m";
+  if (median > MIN_MILLIMETRES_MEDIAN) return "mm";
   throw new InputError(
     `${name}: expected metres from the sensor, found half of the points farther than ${median.toFixed(0)}; ` +
     "label it with amvnet predict and --unit cm or mm (or m, if they are metres)",

@@ -2,31 +2,31 @@
 
 import { quantilesOf, seededRandom } from "./statistics.js";
 
-export const NEAREST = 1.0;  // the least distance of points that are used, metres; the vehicle is nearer
-const CELL = 1.0;  // the side of the cells whose lowest points are used, metres
-const RADIUS = 20.0;  // the largest distance of points that are used, metres
+export const MIN_DISTANCE = 1.0;  // the least distance of points that are used, metres; the vehicle is nearer
+const CELL_SIDE = 1.0;  // the side of the cells whose lowest points are used, metres
+const MAX_DISTANCE = 20.0;  // the largest distance of points that are used, metres
 const HALF_WEIGHT = 8.0;  // the distance at which a cell has half the weight of a cell at the sensor, metres
-const TRIES = 400;  // the number of planes that are tried, each through three low points
-const LEAST_AREA = 1.0;  // the least area of the parallelogram that the three points span, square metres
+const TRIED_PLANES = 400;  // the number of planes that are tried, each through three low points
+const MIN_AREA = 1.0;  // the least area of the parallelogram that the three points span, square metres
 const TOLERANCE = 0.1;  // the largest distance from the plane to a point of the ground, metres
-const STEEPEST = 25.0;  // the largest slope of the ground, degrees; walls and embankments are steeper
-const LEAST_CELLS = 30;  // the least number of cells with points
-const LEAST_AGREEMENT = 0.25;  // the least weighted share of the cells that lie in the plane
+const MAX_SLOPE = 25.0;  // the largest slope of the ground, degrees; walls and embankments are steeper
+const MIN_CELLS = 30;  // the least number of cells with points
+const MIN_AGREEMENT = 0.25;  // the least weighted share of the cells that lie in the plane
 
 // The ground under the sensor may lie off the plane, where a road is curved.
 const NEAR_CELLS = 60;  // the number of cells that show the ground under the sensor
 const MAX_NEAR_OFF = 0.5;  // the largest distance from the plane to their lowest points, metres
 
 // These limits tell which side of the plane is up: things stand on the ground, and there is little below it.
-const OFF_PLANE = 0.3;  // the largest distance from the plane to its points, at the sensor, metres
-const CURVED = 0.02;  // how much this distance grows for each metre from the sensor, metres
+const MAX_OFF_PLANE = 0.3;  // the largest distance from the plane to its points, at the sensor, metres
+const OFF_PLANE_PER_METRE = 0.02;  // how much this distance grows for each metre from the sensor, metres
 const MAX_BELOW = 0.1;  // the largest share of points below the plane, unless more are above it
-const LOWEST = -0.5, HIGHEST = 10.0;  // the limits of the origin's height, metres; a plane above it must be sure
+const MIN_HEIGHT = -0.5, MAX_HEIGHT = 10.0;  // the limits of the origin's height, metres; a plane above it must be sure
 
 // These limits tell whether a plane is sure enough to level a scan by it.
 const SURE_AGREEMENT = 0.3;  // the least weighted share of the cells that lie in the plane
 const SURE_CELLS = 40;  // the least area of these cells, weighted by distance, square metres
-const SURE_SHARE = 0.2;  // the least share of the points within RADIUS that lie in the plane
+const SURE_SHARE = 0.2;  // the least share of the points within MAX_DISTANCE that lie in the plane
 
 /**
  * Return {up, height, isSure} of the ground in points (3 n: x, y, z in metres) whose z axis points roughly up: the unit
@@ -36,16 +36,16 @@ export function findGround(xyz) {
   const points = [];
   for (let i = 0; i < xyz.length; i += 3) {
     const [x, y, z] = [xyz[i], xyz[i + 1], xyz[i + 2]], distance = Math.hypot(x, y);
-    if (distance > NEAREST) points.push({ x, y, z, distance });
+    if (distance > MIN_DISTANCE) points.push({ x, y, z, distance });
   }
-  const around = points.filter(({ distance }) => distance < RADIUS), low = lowestPoints(around);
-  if (low.length < LEAST_CELLS) return null;
+  const around = points.filter(({ distance }) => distance < MAX_DISTANCE), low = lowestPoints(around);
+  if (low.length < MIN_CELLS) return null;
 
   let plane = bestPlane(low), ground = [];
   if (!plane) return null;
   for (let round = 0; round < 3; round++) {
     ground = low.filter((point) => Math.abs(offPlane(point, plane)) < TOLERANCE);
-    if (ground.length < LEAST_CELLS / 2) return null;
+    if (ground.length < MIN_CELLS / 2) return null;
     plane = fitted(ground);
   }
 
@@ -57,9 +57,9 @@ export function findGround(xyz) {
 
   // A plane above the origin may be a ceiling, or the lower ends of far walls.
   const [a, b, c] = plane, height = -c;
-  const isCommon = height < HIGHEST && below <= Math.max(above, MAX_BELOW);
-  const isBelow = height > LOWEST ? isCommon : isSure && below < above / 2;
-  if (agreement <= LEAST_AGREEMENT || !isBelow) return null;
+  const isCommon = height < MAX_HEIGHT && below <= Math.max(above, MAX_BELOW);
+  const isBelow = height > MIN_HEIGHT ? isCommon : isSure && below < above / 2;
+  if (agreement <= MIN_AGREEMENT || !isBelow) return null;
   const length = Math.hypot(a, b, 1), off = offPlaneAtSensor(low, plane);
   const up = [-a / length, -b / length, 1 / length];
   return { up, height: Math.abs(off) > TOLERANCE ? height - off : height, isSure };
@@ -84,7 +84,7 @@ function weightOf(points) {
 function sides(points, plane) {
   let above = 0, below = 0;
   for (const point of points) {
-    const off = offPlane(point, plane), least = OFF_PLANE + CURVED * point.distance;
+    const off = offPlane(point, plane), least = MAX_OFF_PLANE + OFF_PLANE_PER_METRE * point.distance;
     if (off > least) above++;
     if (off < -least) below++;
   }
@@ -93,9 +93,9 @@ function sides(points, plane) {
 
 /** Return the lowest point of each cell around the sensor with its weight; near points have more weight. */
 function lowestPoints(points) {
-  const lowest = new Map(), cells = (2 * RADIUS) / CELL + 1;
+  const lowest = new Map(), cells = (2 * MAX_DISTANCE) / CELL_SIDE + 1;
   for (const point of points) {
-    const cell = Math.floor((point.x + RADIUS) / CELL) * cells + Math.floor((point.y + RADIUS) / CELL);
+    const cell = Math.floor((point.x + MAX_DISTANCE) / CELL_SIDE) * cells + Math.floor((point.y + MAX_DISTANCE) / CELL_SIDE);
     if (!(point.z >= lowest.get(cell)?.z)) lowest.set(cell, point);
   }
   const ascending = [...lowest].sort(([a], [b]) => a - b);
@@ -112,9 +112,9 @@ function bestPlane(low) {
   };
 
   let best = null, most = -Infinity;
-  for (let attempt = 0; attempt < TRIES; attempt++) {
+  for (let attempt = 0; attempt < TRIED_PLANES; attempt++) {
     const plane = planeThrough(drawn(), drawn(), drawn());
-    if (!plane || !(Math.hypot(plane[0], plane[1]) < Math.tan((STEEPEST * Math.PI) / 180))) continue;
+    if (!plane || !(Math.hypot(plane[0], plane[1]) < Math.tan((MAX_SLOPE * Math.PI) / 180))) continue;
     let agreeing = 0;
     for (const point of low) {
       const off = offPlane(point, plane);
@@ -130,7 +130,7 @@ function bestPlane(low) {
 function planeThrough(p, q, r) {
   const [qx, qy, qz, rx, ry, rz] = [q.x - p.x, q.y - p.y, q.z - p.z, r.x - p.x, r.y - p.y, r.z - p.z];
   const area = qx * ry - qy * rx;
-  if (!(Math.abs(area) > LEAST_AREA)) return null;
+  if (!(Math.abs(area) > MIN_AREA)) return null;
   const a = (qz * ry - qy * rz) / area, b = (qx * rz - qz * rx) / area;
   return [a, b, p.z - a * p.x - b * p.y];
 }

@@ -8,15 +8,15 @@ import { interpolate, quantilesOf, seededRandom } from "./statistics.js";
 // The quantiles at these probabilities describe a distribution of intensities.
 const PROBABILITIES = [0.001, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999];
 const MEDIAN = PROBABILITIES.indexOf(0.5), BRIGHT = PROBABILITIES.indexOf(0.9);
-const DARKEST = 0.004;  // the least intensity in a comparison, one step of 8 bits
-const ALIKE = 2;  // the largest ratio of the medians, or of the bright quantiles, of two similar distributions
+const DARKEST_INTENSITY = 0.004;  // the least intensity in a comparison, one step of 8 bits
+const ALIKE_FACTOR = 2;  // the largest ratio of the medians, or of the bright quantiles, of two similar distributions
 // The largest range of 98 % of the intensities, as a share of the median, with which they are constant.
-const CONSTANT = 0.01;
+const CONSTANT_SHARE = 0.01;
 
 /** Return whether nearly all intensities are the same. */
 function isConstant(quantiles) {
   const [low, high] = [0.01, 0.99].map((probability) => quantiles[PROBABILITIES.indexOf(probability)]);
-  return high - low <= CONSTANT * Math.abs(quantiles[MEDIAN]);
+  return high - low <= CONSTANT_SHARE * Math.abs(quantiles[MEDIAN]);
 }
 
 /** Return a function that maps intensities with these quantiles to the distribution of the training. */
@@ -96,10 +96,10 @@ function usualScale(largest, isInteger) {
 }
 
 function areAlike(a, b) {
-  const least = DARKEST;
+  const least = DARKEST_INTENSITY;
   return [MEDIAN, BRIGHT].every((place) => {
     const [low, high] = [Math.max(a[place], least), Math.max(b[place], least)].sort((x, y) => x - y);
-    return high <= ALIKE * low;
+    return high <= ALIKE_FACTOR * low;
   });
 }
 

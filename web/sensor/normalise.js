@@ -3,13 +3,13 @@
 import { InputError } from "../errors.js";
 import { isPlaced } from "../reading/cloud.js";
 import { findFrame, isOnGround, risesOf, tilted, toLevel, UNITS } from "./frame.js";
-import { NEAREST } from "./ground.js";
+import { MIN_DISTANCE } from "./ground.js";
 import { fillIntensity, intensityMap, matchIntensity, missingText, negativeText } from "./intensity.js";
 import { ANY, elevationOf, hasEndsOf, orderRings, rowsOf } from "./rows.js";
 import { quantilesOf } from "./statistics.js";
 
 const FARTHEST = 10_000;  // the limit of coordinates, metres; no LiDAR sees so far
-const LEAST_POINTS = 100;  // the least number of points on which a sensor is measured
+const MIN_POINTS = 100;  // the least number of points on which a sensor is measured
 const LEAST_OWN = 0.15;  // the least share of a scan's points that shows the body of the car
 const QUICK_STEP = 7;  // the step between the points that show the lasers of such a scan
 // The body of nuScenes' car in the frame of its files, metres, and the field of view of its sensor.
@@ -103,9 +103,9 @@ function lasersOf(seen, ring) {
   const elevations = [];
   for (let i = 0; i < seen.length; i += 4) {
     const [x, y, z] = seen.subarray(i, i + 3);
-    if (Math.hypot(x, y) > NEAREST) elevations.push(elevationOf(x, y, z));
+    if (Math.hypot(x, y) > MIN_DISTANCE) elevations.push(elevationOf(x, y, z));
   }
-  if (elevations.length < LEAST_POINTS) return { beams: null, fov_up: null, fov_down: null };
+  if (elevations.length < MIN_POINTS) return { beams: null, fov_up: null, fov_down: null };
   const [bottom, top] = quantilesOf(Float64Array.from(elevations).sort(), [0.005, 0.995]);
   const beams = ring ? new Set(ring).size : null;
   return { beams, fov_up: top, fov_down: bottom };

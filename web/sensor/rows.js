@@ -1,14 +1,14 @@
 // Choose the rows of the points in the range image: by laser if the lasers are known, else by elevation.
 
-import { NEAREST } from "./ground.js";
+import { MIN_DISTANCE } from "./ground.js";
 import { quantilesOf } from "./statistics.js";
 
-const OUTSIDE = 0.16;  // the largest share of points outside a field of view that is wide enough
+const MAX_OUTSIDE_SHARE = 0.16;  // the largest share of points outside a field of view that is wide enough
 const SAME_ANGLE = 6;  // the largest difference of the ends of two fields of view that are alike, degrees
-const LASERS_SEEN = 0.75;  // the least share of a sensor's lasers that have returns in every scan
+const MIN_LASERS_SEEN = 0.75;  // the least share of a sensor's lasers that have returns in every scan
 const SLOPE_SPREAD = 0.035;  // the largest mean deviation of the slopes of one laser; about 2 degrees
 const MAX_RING_SPREAD = 0.2;  // the largest variance of the elevations within the rings, of all their variance
-const LEAST_RING_POINTS = 10;  // the least number of points of a ring whose elevation counts
+const MIN_RING_POINTS = 10;  // the least number of points of a ring whose elevation counts
 const SAME_ELEVATION = 0.1;  // rings that descend by less than this are in order, degrees
 const LEAST_POINTS = 64;  // the least mean number of points of a laser; fewer do not show an order
 const LEAST_MEASURED = 100;  // the least number of points on which a sensor is measured
@@ -45,7 +45,7 @@ export function rowsOf(points, tilted, ring, lasers, { view, sensor, as_is: isAs
   if (view.rows === "laser" && hasEndsOf(lasers, sensor)) {
     const each = ring ?? lasersByOrder(tilted, view.height) ?? lasersByOrder(points, view.height);
     const highest = Math.max(...new Set(each));
-    if (highest >= LASERS_SEEN * view.height && highest < view.height) return byLaser(each);
+    if (highest >= MIN_LASERS_SEEN * view.height && highest < view.height) return byLaser(each);
   }
 
   const elevations = elevationsOf(points), density = sensor.name === ANY ? densityOf(points) : null;
@@ -67,7 +67,7 @@ export function rowsOf(points, tilted, ring, lasers, { view, sensor, as_is: isAs
  * empty and do not count.
  */
 function densityOf(points) {
-  const distant = points.filter((_, i) => Math.hypot(...points.subarray(i - (i % 4), i - (i % 4) + 2)) > NEAREST);
+  const distant = points.filter((_, i) => Math.hypot(...points.subarray(i - (i % 4), i - (i % 4) + 2)) > MIN_DISTANCE);
   const elevations = elevationsOf(distant);
   if (elevations.length < LEAST_MEASURED) return null;
   const counts = new Int32Array((BINS + 2 * AROUND) * SECTORS);
@@ -124,10 +124,10 @@ export function orderRings(points, ring) {
     return { index, radius, waves: [x / radius, y / radius], elevation: elevationOf(x, y, z) };
   });
   const countsOf = (some) => some.reduce((counts, { index }) => counts.set(index, (counts.get(index) ?? 0) + 1), new Map());
-  const distant = countsOf(seen.filter(({ radius }) => radius > NEAREST));
+  const distant = countsOf(seen.filter(({ radius }) => radius > MIN_DISTANCE));
   // The place of a laser that sees only the car is that of these points.
-  const used = seen.filter(({ index, radius }) => radius > NEAREST || (!distant.has(index) && radius > 0)), counts = countsOf(used);
-  if (counts.size < 2 || used.length < LEAST_RING_POINTS * counts.size) return { ring, fault: "" };
+  const used = seen.filter(({ index, radius }) => radius > MIN_DISTANCE || (!distant.has(index) && radius > 0)), counts = countsOf(used);
+  if (counts.size < 2 || used.length < MIN_RING_POINTS * counts.size) return { ring, fault: "" };
 
   const meansOf = (valueOf) => {
     const sums = new Map();
@@ -153,7 +153,7 @@ export function orderRings(points, ring) {
   }
 
   const occurring = [...counts.keys()].sort((a, b) => a - b);
-  const ascending = occurring.filter((index) => distant.get(index) >= LEAST_RING_POINTS).map((index) => means.get(index));
+  const ascending = occurring.filter((index) => distant.get(index) >= MIN_RING_POINTS).map((index) => means.get(index));
   if (!falls(ascending)) return { ring, fault: "" };
   const isReversed = !falls(ascending.map((value) => -value)), highest = Math.max(...new Set(ring));
   const byElevation = [...occurring].sort((a, b) => means.get(a) - means.get(b));
@@ -217,7 +217,7 @@ function viewByElevation(elevations, lasers, { view, sensor, isAsIs }) {
   if (isAsIs && hasEndsOf(lasers, sensor)) return used;
 
   const outside = elevations.filter((elevation) => elevation > used.fov_up || elevation < used.fov_down).length;
-  return outside < OUTSIDE * elevations.length || !measured ? used : between(view, measured, view.height);
+  return outside < MAX_OUTSIDE_SHARE * elevations.length || !measured ? used : between(view, measured, view.height);
 }
 
 /** Return a view between two elevations that is wider by half a step at each end, so that the lasers lie inside. */
