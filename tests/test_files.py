@@ -438,8 +438,7 @@ def test_a_read_only_folder_is_one_line_that_names_the_file(
 def test_an_output_folder_that_is_a_file_is_called_one(tmp_path: Path) -> None:
     path = tmp_path / "out"
     path.write_bytes(PRECIOUS)
-    with pytest.raises(InputError, match="expected a folder to write to, found a file; give"):
-        files.make_folder(path)
+    fails(lambda: files.make_folder(path), "expected a folder to write to, found a file; give")
     assert path.read_bytes() == PRECIOUS
 
 

@@ -17,15 +17,11 @@ from amvnet.inference.journal import JOURNAL, UNFINISHED
 from amvnet.onnx_runner import DESCRIPTION
 from amvnet.outputs import Signature, check_outputs
 
-from fixtures.commands import fails, files, refusal, refused, run_cli, succeed
+from fixtures.commands import contents, fails, files, refusal, refused, run_cli, succeed
 from fixtures.marks import with_full
 
 MINE = b"hours of work"
 ANYTHING = Signature("a file", b"")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in files(folder)}
 
 
 def saved(array: np.ndarray) -> bytes:

@@ -66,9 +66,7 @@ CASES += [(command, "SIGTERM") for command in COMMANDS if command != "predict"]
 
 @pytest.mark.usefixtures("hears_sigint")
 @pytest.mark.parametrize(("command", "end"), CASES)
-def test_the_exit_code_of_every_command(
-    command: str, end: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_exit_code_of_commands(command: str, end: str, monkeypatch: pytest.MonkeyPatch) -> None:
     run, code, words = ENDS[end]
     monkeypatch.setattr(command_line, "run", run)
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]

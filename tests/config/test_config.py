@@ -17,7 +17,8 @@ from amvnet.config.bounds import Range
 from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.config.schema import ModelConfig, PointHeadConfig, Recipe
-from amvnet.errors import InputError
+
+from fixtures.commands import fails
 
 
 def write_recipe(folder: Path, text: str) -> str:
@@ -115,23 +116,15 @@ def test_the_recipes_of_the_benchmarks_have_the_papers_head(recipe: str, size: s
         ("taxonomy: cityscapes", "taxonomy.*cityscapes"),
         ("training: {accelerator: 3}", "accelerator"),
         ("7: seven", "7"),
+        *((text, "") for text in ("- a\n- b", "just words", "a: [1, 2", "a: b: c")),
     ],
 )
 def test_an_input_error_names_a_wrong_key_or_value(tmp_path: Path, text: str, pattern: str) -> None:
-    with pytest.raises(InputError, match=f"mine.yaml.*{pattern}") as error:
-        load_recipe(write_recipe(tmp_path, text))
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("text", ["- a\n- b", "just words", "a: [1, 2", "a: b: c"])
-def test_a_file_without_keys_is_an_input_error(tmp_path: Path, text: str) -> None:
-    with pytest.raises(InputError, match=r"mine\.yaml"):
-        load_recipe(write_recipe(tmp_path, text))
+    fails(lambda: load_recipe(write_recipe(tmp_path, text)), "mine.yaml", *pattern.split(".*"))
 
 
 def test_an_unknown_recipe_is_an_input_error_that_lists_the_known_ones() -> None:
-    with pytest.raises(InputError, match=r"'kitti'.*nuscenes-compact.*simulated"):
-        load_recipe("kitti")
+    fails(lambda: load_recipe("kitti"), "'kitti'", "nuscenes-compact", "simulated")
 
 
 @pytest.mark.parametrize("base", ["nothing-like-it", "3", "[nuscenes]", "{a: 1}", "mine.yaml"])
@@ -139,8 +132,7 @@ def test_a_base_that_is_no_other_recipe_is_an_input_error(
     tmp_path: Path, base: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError):
-        load_recipe(write_recipe(Path(), f"base: {base}"))
+    fails(lambda: load_recipe(write_recipe(Path(), f"base: {base}")))
 
 
 @pytest.mark.parametrize("base", ["nuscenes-compact", "semantickitti"])
@@ -210,8 +202,7 @@ def test_a_users_file_may_build_on_another_users_file(tmp_path: Path) -> None:
     ],
 )
 def test_a_number_out_of_its_range_gets_an_error_with_the_range(tmp_path: Path, text: str) -> None:
-    with pytest.raises(InputError, match=r"mine\.yaml: .*expected .* found .*correct the value"):
-        load_recipe(write_recipe(tmp_path, text))
+    fails(lambda: load_recipe(write_recipe(tmp_path, text)), "mine.yaml: ", "correct the value")
 
 
 def test_every_number_of_a_recipe_has_two_bounds() -> None:

@@ -280,15 +280,8 @@ BOMBS: dict[str, tuple[str, Callable[[Path], None], str]] = {
 
 # A bomb of each kind: what its header claims is too much, or the process that reads it meets its
 # limit of memory, of a file's size or of time.
-QUICK = (
-    "columns.npz",
-    "bomb.pcd",
-    "lz4.mcap",
-    "bomb.bin.gz",
-    "schema.db3",
-    "number.xyz",
-    "merges.yaml",
-)
+QUICK = ["columns.npz", "bomb.pcd", "lz4.mcap", "bomb.bin.gz"]
+QUICK += ["schema.db3", "number.xyz", "merges.yaml"]
 
 
 def write_bomb(name: str, folder: Path) -> Path:

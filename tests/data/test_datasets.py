@@ -64,9 +64,7 @@ def test_records_are_in_order_and_unique(layout: Layout, dataset: Dataset) -> No
     assert [len(dataset.read(record)) for record in records] == [*COUNTS, *COUNTS]
 
 
-def test_a_missing_sequence_is_answered_by_those_that_exist(
-    layout: Layout, dataset: Dataset
-) -> None:
+def test_a_missing_sequence_is_answered_by_the_existing(layout: Layout, dataset: Dataset) -> None:
     fails(lambda: dataset.records(["77"]), dataset.root, "77", *layout.sequences)
 
 
@@ -98,9 +96,7 @@ def test_predictions_round_trip(dataset: Dataset, record: ScanFile, tmp_path: Pa
     assert predicted.tolist() == ids.tolist()
 
 
-def test_ids_that_do_not_fit_are_not_written(
-    dataset: Dataset, record: ScanFile, tmp_path: Path
-) -> None:
+def test_unfit_ids_are_not_written(dataset: Dataset, record: ScanFile, tmp_path: Path) -> None:
     write = partial(dataset.write_labels, record, tmp_path, dataset.read(record))
     fails(lambda: write(np.ones(6)), record.path, 7)
     fails(lambda: write(np.full(7, 20)), "20")
@@ -184,9 +180,7 @@ def test_lost_returns_of_nuscenes_get_the_most_frequent_class_in_files(tmp_path:
     assert np.fromfile(path, np.uint8)[0] == 0
 
 
-def test_one_lost_return_keeps_its_place(
-    layout: Layout, dataset: Dataset, record: ScanFile
-) -> None:
+def test_a_lost_return_keeps_its_place(layout: Layout, dataset: Dataset, record: ScanFile) -> None:
     values = np.fromfile(layout.first_points, np.float32)
     values[0] = np.nan
     values.tofile(layout.first_points)

@@ -22,18 +22,8 @@ METADATA = "drive/metadata.yaml"
 FORMATS = [*WRITERS, METADATA]
 HEADER = 400  # bytes: most headers are within them
 MAX_MEMORY = 2 << 30  # bytes
-TELLING_BYTES = [
-    b"\x00",
-    b"\xff",
-    b"\x7f",
-    b"9",
-    b"-",
-    b" ",
-    b"\n",
-    bytes(4),
-    b"\xff" * 4,
-    b"\xff" * 8,
-]
+TELLING_BYTES = [b"\x00", b"\xff", b"\x7f", b"9", b"-", b" ", b"\n"]
+TELLING_BYTES += [bytes(4), b"\xff" * 4, b"\xff" * 8]
 
 
 @dataclass(frozen=True)

@@ -225,9 +225,7 @@ def test_fewer_poses_than_scans_are_one_line(tmp_path: Path, write: Callable[[Pa
         (np.s_[:, :, 1], -1, "no rotation"),  # mirrored
     ],
 )
-def test_what_is_no_rigid_motion_is_one_line(
-    tmp_path: Path, index: Any, factor: float, word: str
-) -> None:
+def test_no_rigid_motion_is_one_line(tmp_path: Path, index: Any, factor: float, word: str) -> None:
     poses = POSES.copy()
     poses[index] *= factor
     path = write_kitti(tmp_path / "poses.txt", poses)

@@ -36,6 +36,7 @@ from fixtures.tiny import (
     make_streets,
     street,
     with_intensities,
+    with_model,
     write_recipe,
     write_scan,
 )
@@ -61,16 +62,6 @@ def weights() -> Weights:
 @pytest.fixture(scope="module")
 def dataset(world: Path) -> Dataset:
     return open_dataset(f"semantickitti:{world / 'data'}")
-
-
-def with_tau(weights: Weights, tau: float) -> Weights:
-    assertion = replace(weights.model.assertion, threshold=tau)
-    return replace(weights, model=replace(weights.model, assertion=assertion))
-
-
-def with_lead(weights: Weights, lead: float) -> Weights:
-    assertion = replace(weights.model.assertion, lead=lead)
-    return replace(weights, model=replace(weights.model, assertion=assertion))
 
 
 def analyze_08(dataset: Dataset, weights: Weights) -> Analysis:
@@ -102,7 +93,7 @@ def column(path: Path, name: str) -> list[str]:
 @pytest.mark.parametrize("tau", [0.0, 0.31, 0.85, SWEPT_BINS / BINS])
 def test_a_swept_tau_equals_weights_with_it(dataset: Dataset, weights: Weights, tau: float) -> None:
     value, uncertain, miou, accuracy = analyze_08(dataset, weights).sweep()[round(tau * BINS)]
-    share, expected = figures_of(dataset, with_tau(weights, tau))
+    share, expected = figures_of(dataset, with_model(weights, "assertion", threshold=tau))
     assert value == pytest.approx(tau)
 
     # A point whose similarity is tau to the last bit may fall to either side.
@@ -115,9 +106,9 @@ def test_a_swept_tau_equals_weights_with_it(dataset: Dataset, weights: Weights, 
 def test_a_swept_tau_gives_what_weights_with_that_tau_give_if_the_head_has_only_disputed_points(
     dataset: Dataset, weights: Weights
 ) -> None:
-    led = with_lead(weights, 1.3)
+    led = with_model(weights, "assertion", lead=1.3)
     _, _, miou, _ = analyze_08(dataset, led).sweep()[85]
-    _, expected = figures_of(dataset, with_tau(led, 0.85))
+    _, expected = figures_of(dataset, with_model(led, "assertion", threshold=0.85))
     assert miou == pytest.approx(100 * expected["miou"], abs=0.02)
     assert miou != pytest.approx(analyze_08(dataset, weights).sweep()[85][2], abs=0.02)
 
@@ -152,7 +143,7 @@ def test_a_tau_above_those_that_are_swept_is_analyzed(
     dataset: Dataset, weights: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(analysis, "SWEPT_BINS", 50)
-    weights = with_tau(weights, 0.8)
+    weights = with_model(weights, "assertion", threshold=0.8)
     analyzed = analyze_08(dataset, weights)
     evaluation = analyzed.evaluation
     assert analyzed.points[50:80].sum() > 0
@@ -196,14 +187,8 @@ def test_analyze_writes_each_figure_as_picture_and_table(world: Path, tmp_path: 
 
     counts = column(out / "similarity.csv", "points")
     assert sum(map(int, counts)) == 1000
-    assert column(out / "methods.csv", "method") == [
-        "RV",
-        "BEV",
-        "arithmetic mean",
-        "maximum",
-        "geometric mean",
-        "AMVNet",
-    ]
+    simple = ["arithmetic mean", "maximum", "geometric mean"]
+    assert column(out / "methods.csv", "method") == ["RV", "BEV", *simple, "AMVNet"]
 
 
 @pytest.mark.full

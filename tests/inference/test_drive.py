@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import save
 
 from fixtures.bag_poses import drive_clouds, drive_odometry, odometry, pose_at, write_bag
-from fixtures.commands import fails, files, refused, run_cli, succeed
+from fixtures.commands import contents, fails, files, refused, run_cli, succeed
 from fixtures.drives import HEIGHT, SCANS, drive_poses, drive_scans, write_drive
 from fixtures.tiny import fresh_weights
 
@@ -47,13 +47,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def predict(world: Path, out: Path, *options: object) -> str:
-    words = " ".join(map(str, options))
-    return f"predict {world}/data --weights {world}/w.safetensors --drive --out {out} {words}"
-
-
-def labels_in(folder: Path) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in files(folder)}
+def predict(world: Path, out: Path, options: str = "", data: Path | None = None) -> str:
+    data = data or world / "data"
+    return f"predict {data} --weights {world}/w.safetensors --drive --out {out} {options}"
 
 
 def test_predict_writes_the_labels_of_python(world: Path) -> None:
@@ -169,7 +165,7 @@ def test_an_interrupted_run_resumes_to_the_same_labels(
     assert len(files(tmp_path) - {".unfinished.jsonl"}) == 12
 
     succeed(predict(world, tmp_path, "--resume"))
-    assert labels_in(tmp_path) == labels_in(world / "labels")
+    assert contents(tmp_path) == contents(world / "labels")
 
 
 def test_scans_of_two_drives_are_fused_each_with_its_own(world: Path, tmp_path: Path) -> None:
@@ -183,20 +179,20 @@ def test_scans_of_two_drives_are_fused_each_with_its_own(world: Path, tmp_path: 
     one_by_one = [path for pair in zip(*words, strict=True) for path in pair]
     succeed(f"predict {' '.join(one_by_one)} --out {tmp_path}/one_by_one {options}")
     succeed(f"predict {tmp_path}/a {tmp_path}/b --out {tmp_path}/apart {options}")
-    assert labels_in(tmp_path / "one_by_one") == labels_in(tmp_path / "apart")
+    assert contents(tmp_path / "one_by_one") == contents(tmp_path / "apart")
 
 
 def test_a_changed_scan_is_labelled_again_with_its_reach(world: Path, tmp_path: Path) -> None:
     write_drive(tmp_path / "data")
-    command = f"predict {tmp_path}/data --weights {world}/w.safetensors --drive --out {tmp_path}"
-    succeed(f"{command}/resumed")
+    data = tmp_path / "data"
+    succeed(predict(world, tmp_path / "resumed", data=data))
     path = tmp_path / "data/sequences/00/velodyne/000012.bin"  # none of those that are measured
-    before = labels_in(tmp_path / "resumed")
+    before = contents(tmp_path / "resumed")
     path.write_bytes(path.read_bytes()[: 16 * 1500])
-    succeed(f"{command}/resumed --resume")
-    succeed(f"{command}/new")
-    assert labels_in(tmp_path / "resumed") == labels_in(tmp_path / "new")
-    changed = dict(labels_in(tmp_path / "new").items() - before.items())
+    succeed(predict(world, tmp_path / "resumed", "--resume", data))
+    succeed(predict(world, tmp_path / "new", data=data))
+    assert contents(tmp_path / "resumed") == contents(tmp_path / "new")
+    changed = dict(contents(tmp_path / "new").items() - before.items())
     assert 1 < len(changed) <= REACH + 1 + REACH
 
 
@@ -205,12 +201,12 @@ def test_a_drive_with_a_broken_scan_resumes_to_the_same_labels(world: Path, tmp_
     broken = tmp_path / "data/sequences/00/velodyne/000010.bin"
     broken.write_bytes(broken.read_bytes()[:-3])
     out = tmp_path / "out"
-    command = f"predict {tmp_path}/data --weights {world}/w.safetensors --drive --out {out}"
+    command = predict(world, out, data=tmp_path / "data")
     assert run_cli(*command.split())[0] == 3
-    whole = labels_in(out)
+    whole = contents(out)
     (out / "sequences/00/predictions/000014.label").unlink()
     assert run_cli(*command.split(), "--resume")[0] == 3
-    assert labels_in(out) == whole
+    assert contents(out) == whole
 
 
 @pytest.mark.full
@@ -230,55 +226,31 @@ def of_camera(poses: Poses) -> Poses:
     return turn @ poses @ np.linalg.inv(turn)
 
 
-def stretched(poses: Poses) -> Poses:
-    poses = poses.copy()
-    poses[:, :3, 3] *= 100  # centimetres
+def changed(part: Any, values: Any) -> Poses:
+    poses = POSES.copy()
+    poses[part] = values
     return poses
 
 
-def a_quarter_longer(poses: Poses) -> Poses:
-    poses = poses.copy()
-    poses[:, :3, 3] *= 1.25
-    return poses
+PLACES = np.s_[:, :3, 3]
+IN_CENTIMETRES = changed(PLACES, 100 * POSES[PLACES])
+DO_NOT_FIT = {
+    "of the camera": of_camera(POSES),
+    "in centimetres": IN_CENTIMETRES,
+    "a quarter longer": changed(PLACES, 1.25 * POSES[PLACES]),
+    "backwards": POSES[::-1],
+    "fewer": POSES[1:],
+    "lost": changed(np.s_[3:], np.nan),
+    "first without a fix": changed(np.s_[1:, :2, 3], POSES[1:, :2, 3] + (690_000, 5_335_000)),
+    "one off": changed(np.s_[7, 0, 3], POSES[7, 0, 3] + 20),
+}
 
 
-def backwards(poses: Poses) -> Poses:
-    return poses[::-1].copy()
-
-
-def fewer(poses: Poses) -> Poses:
-    return poses[1:]
-
-
-def lost(poses: Poses) -> Poses:
-    poses = poses.copy()
-    poses[3:] = np.nan
-    return poses
-
-
-def first_without_a_fix(poses: Poses) -> Poses:
-    poses = poses.copy()
-    poses[1:, :2, 3] += (690_000, 5_335_000)
-    return poses
-
-
-def one_off(poses: Poses) -> Poses:
-    poses = poses.copy()
-    poses[7, 0, 3] += 20
-    return poses
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        *(of_camera, stretched, a_quarter_longer, backwards, fewer, lost),
-        *(first_without_a_fix, one_off),
-    ],
-)
+@pytest.mark.parametrize("kind", DO_NOT_FIT)
 def test_poses_that_do_not_fit_are_one_line_and_nothing_is_written(
-    world: Path, tmp_path: Path, spoil: Callable[[Poses], Poses]
+    world: Path, tmp_path: Path, kind: str
 ) -> None:
-    np.save(tmp_path / "poses.npy", spoil(POSES))
+    np.save(tmp_path / "poses.npy", DO_NOT_FIT[kind])
     refused(predict(world, tmp_path / "out", f"--poses {tmp_path}/poses.npy"), "poses.npy")
     assert not (tmp_path / "out").exists()
 
@@ -289,28 +261,23 @@ def turned(poses: Poses) -> Poses:
     return poses @ turn
 
 
-def in_whole_metres(poses: Poses) -> Poses:
-    poses = poses.copy()
-    poses[:, :3, 3] = np.round(poses[:, :3, 3])
-    return poses
+LESS_EXACT = {
+    "turned": turned(POSES),
+    "in whole metres": changed(PLACES, np.round(POSES[PLACES])),
+    "without rotations": changed(np.s_[:, :3, :3], np.eye(3)),
+}
 
 
-def without_rotations(poses: Poses) -> Poses:
-    poses = poses.copy()
-    poses[:, :3, :3] = np.eye(3)
-    return poses
-
-
-@pytest.mark.parametrize("spoil", [turned, in_whole_metres, without_rotations])
+@pytest.mark.parametrize("kind", LESS_EXACT)
 def test_poses_that_are_less_exact_than_the_scans_do_not_pass_in_silence(
-    world: Path, tmp_path: Path, spoil: Callable[[Poses], Poses]
+    world: Path, tmp_path: Path, kind: str
 ) -> None:
     scans, _ = find_inputs([f"{world}/data"]).scans()
     lines: list[str] = []
     np.save(tmp_path / "poses.npy", POSES)
     find_poses(scans, tmp_path / "poses.npy", report=lines.append)
     assert len(lines) == 1
-    np.save(tmp_path / "poses.npy", spoil(POSES))
+    np.save(tmp_path / "poses.npy", LESS_EXACT[kind])
     try:
         find_poses(scans, tmp_path / "poses.npy", report=lines.append)
     except InputError as error:
@@ -338,11 +305,11 @@ def test_poses_that_were_turned_by_a_calibration_say_so(world: Path, tmp_path: P
 
 
 def test_poses_are_not_estimated_twice(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drive_module, "_estimated", lambda *_: stretched(POSES))
+    monkeypatch.setattr(drive_module, "_estimated", lambda *_: IN_CENTIMETRES)
     scans, _ = find_inputs([f"{world}/data"]).scans()
     monkeypatch.setattr(type(scans[0].dataset), "poses", lambda *_: None)
     fails(lambda: find_poses(scans), "KISS-ICP", "give poses, or scans that follow")
-    monkeypatch.setattr(type(scans[0].dataset), "poses", lambda *_: stretched(POSES))
+    monkeypatch.setattr(type(scans[0].dataset), "poses", lambda *_: IN_CENTIMETRES)
     fails(lambda: find_poses(scans), "the dataset", "correct them")
 
 
@@ -388,12 +355,8 @@ def test_poses_of_a_standing_car_fit() -> None:
     check_fit([Pair(points, points + 0.01, np.eye(4))], "poses", "advice")
     moved = np.eye(4)
     moved[0, 3] = 3
-    fails(
-        lambda: check_fit([Pair(points, points + 0.01, moved)], "poses", "advice"),
-        "poses",
-        "apart",
-        "advice",
-    )
+    pair = Pair(points, points + 0.01, moved)
+    fails(lambda: check_fit([pair], "poses", "advice"), "poses", "apart", "advice")
 
 
 def test_a_drive_needs_scans_of_one_recording_in_a_row(world: Path, tmp_path: Path) -> None:
@@ -406,8 +369,8 @@ def test_a_drive_needs_scans_of_one_recording_in_a_row(world: Path, tmp_path: Pa
     write_drive(tmp_path / "data", "01", 3)
     write_drive(tmp_path / "data", "02", 3)
     np.save(tmp_path / "poses.npy", POSES)
-    words = f"--weights {world}/w.safetensors --out {tmp_path}/out --drive"
-    refused(f"predict {tmp_path}/data {words} --poses {tmp_path}/poses.npy", "2 recordings")
+    options = f"--poses {tmp_path}/poses.npy"
+    refused(predict(world, tmp_path / "out", options, tmp_path / "data"), "2 recordings")
 
 
 @pytest.mark.full
@@ -417,11 +380,8 @@ def test_a_broken_scan_is_left_out_of_its_drive(world: Path, tmp_path: Path) -> 
     for name in broken:
         path = tmp_path / "data/sequences/00/velodyne" / name
         path.write_bytes(path.read_bytes()[:-3])
-    code, error = run_cli(
-        *predict(tmp_path, tmp_path / "out")
-        .replace(f"{tmp_path}/w.safetensors", f"{world}/w.safetensors")
-        .split()
-    )
+    command = predict(world, tmp_path / "out", data=tmp_path / "data")
+    code, error = run_cli(*command.split())
     assert code == 3
     assert all(name in error for name in broken)
     assert len(files(tmp_path / "out")) == SCANS - len(broken)
@@ -468,7 +428,7 @@ def test_odometry_of_a_bag_equals_a_file_of_poses(world: Path, bag: Path, tmp_pa
     for poses in ("/odom", tmp_path / "tum.txt"):
         folders.append(tmp_path / Path(poses).stem)
         succeed(command_on(bag, world, folders[-1], poses))
-    assert labels_in(folders[0]) == labels_in(folders[1])
+    assert contents(folders[0]) == contents(folders[1])
     assert len(files(folders[0])) == BAG_SCANS
 
 
@@ -540,6 +500,6 @@ def test_without_poses_and_kiss_icp_one_line_says_what_to_do(
     monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
     write_drive(tmp_path / "data")
     (tmp_path / "data/sequences/00/poses.txt").unlink()
-    command = f"predict {tmp_path}/data --weights {world}/w.safetensors --out {tmp_path}/out"
-    refused(f"{command} --drive", 'pip install "amvnet[drives]"')
+    command = predict(world, tmp_path / "out", data=tmp_path / "data")
+    refused(command, 'pip install "amvnet[drives]"')
     assert not (tmp_path / "out").exists()

@@ -24,7 +24,7 @@ from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.drives.world_map import check_ending
 
-from fixtures.commands import fails, files, run_cli
+from fixtures.commands import fails, files, refusal, run_cli
 from fixtures.marks import with_quick
 from fixtures.scan_writers import some_points, write_bag1, write_pcd
 
@@ -307,10 +307,7 @@ def predict(world: Path, out: Path, *words: object) -> tuple[int, str]:
 
 
 def failure(world: Path, out: Path, *words: object) -> str:
-    code, message = predict(world, out, *words)
-    assert code == 2
-    assert message.count("\n") == 1
-    return message
+    return refusal("predict", *words, "--weights", world / "w.safetensors", "--out", out)
 
 
 @pytest.mark.parametrize("kind", with_quick(KINDS, ["ply"]))

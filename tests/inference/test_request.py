@@ -15,7 +15,7 @@ from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.lidars import Sensor
 
 from fixtures.commands import fails
-from fixtures.tiny import fresh_weights
+from fixtures.tiny import fresh_weights, with_model
 
 OTHERS: dict[str, Any] = {
     "weights": fresh_weights(seed=1),
@@ -53,12 +53,9 @@ def test_each_field_changes_the_settings() -> None:
 
 def test_weights_that_choose_other_points_for_the_head_change_the_settings() -> None:
     weights = fresh_weights()
-    model = weights.model
-    lead = replace(model, assertion=replace(model.assertion, lead=3.0))
-    cell = replace(model, point_head=replace(model.point_head, cell=0.1))
-    for other in (lead, cell):
-        request = LabellingRequest(replace(weights, model=other))
-        assert request.settings != LabellingRequest(weights).settings
+    settings = LabellingRequest(weights).settings
+    for part, changes in (("assertion", {"lead": 3.0}), ("point_head", {"cell": 0.1})):
+        assert LabellingRequest(with_model(weights, part, **changes)).settings != settings
 
 
 def test_equal_requests_have_equal_settings() -> None:

@@ -25,7 +25,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.runtime.memory import available_memory
 from amvnet.viewing.shown_scans import show_scans
 
-from fixtures.commands import refused, run_cli
+from fixtures.commands import fails, refused, run_cli
 from fixtures.marks import with_full
 from fixtures.processes import PATIENCE
 from fixtures.tiny import fresh_weights
@@ -45,8 +45,7 @@ def test_an_error_comes_in_its_turn() -> None:
 
     results = stream_scans(range(6), load, lambda n, scan: n, at_once=2)
     assert [next(results) for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(InputError, match="broken"):
-        next(results)
+    fails(lambda: next(results), "broken")
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,7 +21,7 @@ from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails
 from fixtures.sensors import rings_of
-from fixtures.tiny import THRESHOLD, fresh_weights, street, without
+from fixtures.tiny import THRESHOLD, fresh_weights, street, with_model, without
 
 K = 19
 POINTS = street(5, 600)[0]
@@ -146,8 +145,7 @@ def test_a_scan_is_its_points_which_stay(segmenter: Segmenter, result: Segmentat
 )
 @pytest.mark.parametrize("method", METHOD_NAMES)
 def test_a_scan_without_points_is_refused(points: np.ndarray, method: MethodName) -> None:
-    with pytest.raises(InputError):
-        amvnet.load(WEIGHTS, method=method)(points.astype(np.float32))
+    fails(lambda: amvnet.load(WEIGHTS, method=method)(points.astype(np.float32)))
 
 
 def test_probabilities_are_the_scores_with_rows_that_sum_to_1(segmenter: Segmenter) -> None:
@@ -348,14 +346,12 @@ def test_a_tau_that_is_no_cosine_of_probabilities_is_refused(tau: float) -> None
     ("option", "value"), [("device", "abacus"), ("device", "cuda:99"), ("method", "vote")]
 )
 def test_an_unknown_device_or_method_is_refused(option: str, value: Any) -> None:
-    with pytest.raises(InputError):
-        amvnet.load(WEIGHTS, **{option: value})
+    fails(lambda: amvnet.load(WEIGHTS, **{option: value}))
 
 
 def test_rows_by_ring_need_a_ring() -> None:
     segmenter = amvnet.load(fresh_weights(NUSCENES))
-    with pytest.raises(InputError, match="ring"):
-        segmenter(POINTS)
+    fails(lambda: segmenter(POINTS), "ring")
     ring = rings_of(POINTS, 32)
     assert segmenter(Scan(POINTS, ring=ring)).labels.max() <= 16
 
@@ -391,8 +387,7 @@ def test_the_rows_of_a_scan_take_precedence_over_its_elevations_and_rings() -> N
 
 
 def segmenter_by_ring(weights: Weights) -> Segmenter:
-    view = replace(weights.model.range_view, rows="ring")
-    return amvnet.load(replace(weights, model=replace(weights.model, range_view=view)))
+    return amvnet.load(with_model(weights, "range_view", rows="ring"))
 
 
 def test_scans_with_rows_and_without_go_through_the_networks_together() -> None:
@@ -406,8 +401,7 @@ def test_scans_with_rows_and_without_go_through_the_networks_together() -> None:
 
 def test_rows_of_other_weights_are_refused() -> None:
     row = np.full(len(POINTS), WEIGHTS.model.range_view.height)
-    with pytest.raises(InputError, match="rows from 0 to"):
-        amvnet.load(WEIGHTS)(Scan(POINTS, row=row))
+    fails(lambda: amvnet.load(WEIGHTS)(Scan(POINTS, row=row)), "rows from 0 to")
 
 
 # ---- fusion of scores
@@ -428,8 +422,7 @@ def test_fused_scores_give_the_segmenters_labels(segmenter: Segmenter, points: n
 
 
 def test_fusing_with_weights_takes_their_lead(result: Segmentation) -> None:
-    assertion = replace(WEIGHTS.model.assertion, lead=1.3)
-    weights = replace(WEIGHTS, model=replace(WEIGHTS.model, assertion=assertion))
+    weights = with_model(WEIGHTS, "assertion", lead=1.3)
     expected = amvnet.load(weights)(POINTS)
     assert np.array_equal(expected.uncertain, result.uncertain)
     assert np.count_nonzero(expected.labels != result.labels) > 0
@@ -477,14 +470,12 @@ def wrong_shapes() -> dict[str, tuple[np.ndarray, np.ndarray]]:
 @pytest.mark.parametrize("kind", wrong_shapes())
 def test_fusing_scores_of_wrong_shapes_is_refused(kind: str) -> None:
     f, g = wrong_shapes()[kind]
-    with pytest.raises(InputError):
-        fuse(POINTS, f, g, head=WEIGHTS)
+    fails(lambda: fuse(POINTS, f, g, head=WEIGHTS))
 
 
 def test_fusing_with_weights_without_a_head_is_refused(result: Segmentation) -> None:
     headless = without(WEIGHTS, "point_head")
-    with pytest.raises(InputError, match="head"):
-        fuse(POINTS, *both_networks(result), head=headless)
+    fails(lambda: fuse(POINTS, *both_networks(result), head=headless), "head")
 
 
 # ---- the package

@@ -16,7 +16,7 @@ from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 from amvnet.weights.verdict import Verdict
 
 from fixtures.commands import run_cli
-from fixtures.tiny import fresh_weights, street, without
+from fixtures.tiny import fresh_weights, street, with_model, without
 
 POINTS = street(5, 400)[0]
 
@@ -148,10 +148,7 @@ def test_predict_says_the_share_of_the_run(
 def test_predict_warns_and_says_what_to_try(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    weights = with_usual(0.0)
-    everywhere = replace(weights.model.assertion, threshold=1.0)
-    weights = replace(weights, model=replace(weights.model, assertion=everywhere))
-
+    weights = with_model(with_usual(0.0), "assertion", threshold=1.0)  # uncertain everywhere
     text = said(world, tmp_path, weights, capsys)
     (warning,) = [line for line in text.splitlines() if line.startswith("warning: ")]
     assert "100.0%" in warning

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from amvnet.data.datasets.open import open_dataset
 from lidarstreets import LIDAR_MODELS, SimulatedScan, SimulationError, simulate, writing
 from lidarstreets.sensing.sensors import LidarModel
 
+from fixtures.commands import contents
 from fixtures.tiny import fake_drive, make_simulation_quick
 from fixtures.waiting import wait_for_end
 
@@ -29,11 +29,6 @@ pytest.importorskip("embreex")
 LINUX = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
 SCENES = ("simulated-0000", "simulated-0001")
 SETTINGS: dict[str, Any] = {"sensor": "hdl32e", "sequences": 2, "scans": 3, "seed": 2}
-
-
-def digests(folder: Path) -> dict[str, str]:
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return {str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def drive_quickly(
@@ -76,7 +71,7 @@ def table(folder: Path, name: str) -> list[dict[str, Any]]:
 @pytest.mark.full
 def test_two_processes_write_the_same_bytes_as_one(real_nuscenes: Path, tmp_path: Path) -> None:
     again = simulate(tmp_path, **SETTINGS, processes=2)
-    assert digests(again) == digests(real_nuscenes)
+    assert contents(again) == contents(real_nuscenes)
 
 
 def test_a_stopped_simulation_ends_the_same(nuscenes: Path, quick: None, tmp_path: Path) -> None:
@@ -90,7 +85,7 @@ def test_a_stopped_simulation_ends_the_same(nuscenes: Path, quick: None, tmp_pat
     counts: list[int] = []
     simulate(tmp_path, **SETTINGS, progress=lambda done, total: counts.append(done))
     assert counts == [4, 5, 6]  # the first scene was complete
-    assert digests(tmp_path) == digests(nuscenes)
+    assert contents(tmp_path) == contents(nuscenes)
 
 
 SCANS = 1000  # of each sequence, far more than are ever written
@@ -175,9 +170,9 @@ def is_running(process: Path) -> bool:
 
 def test_a_complete_simulation_is_kept(nuscenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(writing, "drive_street", lambda *_: pytest.fail("simulated again"))
-    before = digests(nuscenes)
+    before = contents(nuscenes)
     simulate(nuscenes, **SETTINGS)
-    assert digests(nuscenes) == before
+    assert contents(nuscenes) == before
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"seed": 3}', "[" * 100_000, "\x00" * 9])
@@ -188,12 +183,12 @@ def test_a_sequence_whose_record_is_broken_is_written_again(
     make_simulation_quick(monkeypatch)
     settings: dict[str, Any] = {"scans": 1, "seed": 3}
     simulate(tmp_path, sequences=2, **settings)
-    before = digests(tmp_path)
+    before = contents(tmp_path)
     (tmp_path / ".simulation/0001.json").write_text(content)
     with pytest.raises(SimulationError, match=r"0001\.json: expected .* simulate sequence 0001"):
         simulate(tmp_path, sequences=1, **settings)
     simulate(tmp_path, sequences=2, **settings)
-    assert digests(tmp_path) == before
+    assert contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("other", [{"seed": 3}, {"scans": 4}, {"sensor": "hdl64e"}])

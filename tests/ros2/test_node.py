@@ -53,6 +53,7 @@ RECORD = np.dtype(
     }
 )
 DRIVE_SCANS = 6
+Start = Callable[..., Any]  # starts a node with some parameters
 # All that is else measured in the first scans, which are others in `predict`.
 SENSOR = {"height": 1.73, "axes": "x-forward", "unit": "m", "rotate": "0,0,0"}
 SENSOR |= {"intensity_scale": 1.0, "sensor": "hdl64e"}
@@ -64,11 +65,14 @@ def scan(seed: int) -> np.ndarray:
     return points
 
 
-def ros_message(points: np.ndarray, **changes: Any) -> Any:
-    """Return a message as rclpy gives it, with an array of bytes."""
-    message = cloud_message(STORE, points, **changes)
+def as_rclpy_gives_it(message: Any) -> Any:
+    """Return a message with an array of bytes."""
     message.data = array("B", message.data.tobytes())
     return message
+
+
+def ros_message(points: np.ndarray, **changes: Any) -> Any:
+    return as_rclpy_gives_it(cloud_message(STORE, points, **changes))
 
 
 @pytest.fixture
@@ -77,7 +81,7 @@ def weights(world: Path) -> Path:
 
 
 @pytest.fixture
-def start(monkeypatch: pytest.MonkeyPatch, weights: Path) -> Iterator[Callable[..., Any]]:
+def start(monkeypatch: pytest.MonkeyPatch, weights: Path) -> Iterator[Start]:
     """Return a function that starts a node with some parameters."""
     nodes = []
 
@@ -116,7 +120,7 @@ def report(node: Any) -> Any:
 
 @pytest.mark.parametrize("padded", [False, True])
 def test_labels_are_those_of_predict_on_a_bag(
-    start: Callable[..., Any], weights: Path, tmp_path: Path, padded: bool
+    start: Start, weights: Path, tmp_path: Path, padded: bool
 ) -> None:
     scans = [scan(0), scan(1)]
     bag = write_bag2(tmp_path / "bag", {"/points": scans}, StoragePlugin.MCAP, padded=padded)
@@ -142,7 +146,7 @@ def test_labels_are_those_of_predict_on_a_bag(
     assert len(set(raw)) > 1
 
 
-def test_messages_keep_the_header_and_the_rows_of_the_scan(start: Callable[..., Any]) -> None:
+def test_messages_keep_the_header_and_the_rows_of_the_scan(start: Start) -> None:
     node = start()
     message = ros_message(scan(0), padded=True)
     send(node, message)
@@ -156,7 +160,7 @@ def test_messages_keep_the_header_and_the_rows_of_the_scan(start: Callable[..., 
         assert [field.name for field in published.fields] == names
 
 
-def test_nothing_is_encoded_that_nobody_subscribes_to(start: Callable[..., Any]) -> None:
+def test_nothing_is_encoded_that_nobody_subscribes_to(start: Start) -> None:
     node = start()
     node.publishers["~/cloud"].subscriptions = 0
     send(node, ros_message(scan(0)))
@@ -164,7 +168,7 @@ def test_nothing_is_encoded_that_nobody_subscribes_to(start: Callable[..., Any])
     assert len(node.publishers["~/labels"].messages) == 1
 
 
-def test_a_single_network_has_no_uncertain_points(start: Callable[..., Any]) -> None:
+def test_a_single_network_has_no_uncertain_points(start: Start) -> None:
     node = start(method="rv")
     send(node, ros_message(scan(0)))
     published = over_the_wire(node.publishers["~/labels"].messages[-1])
@@ -173,7 +177,7 @@ def test_a_single_network_has_no_uncertain_points(start: Callable[..., Any]) -> 
 
 @pytest.mark.parametrize("method", ["amvnet", "rv", "bev"])
 def test_the_diagnostics_have_the_verdict_of_other_entries(
-    start: Callable[..., Any], weights: Path, tmp_path: Path, method: Any
+    start: Start, weights: Path, tmp_path: Path, method: Any
 ) -> None:
     np.save(tmp_path / "scan.npy", scan(0))
     verdict = amvnet.load(weights, method=method)(tmp_path / "scan.npy").verdict
@@ -187,7 +191,7 @@ def test_the_diagnostics_have_the_verdict_of_other_entries(
     assert status.message.startswith(str(verdict) if verdict.is_doubtful else "labelling")
 
 
-def test_a_broken_message_is_reported_and_the_next_one_labelled(start: Callable[..., Any]) -> None:
+def test_a_broken_message_is_reported_and_the_next_one_labelled(start: Start) -> None:
     node = start()
     send(node, ros_message(scan(0), width=10**6))
     send(node, ros_message(scan(0), fields=[]))
@@ -207,7 +211,7 @@ def test_a_broken_message_is_reported_and_the_next_one_labelled(start: Callable[
     assert report(node).level != status.ERROR
 
 
-def test_the_diagnostics_tell_latency_and_counts(start: Callable[..., Any]) -> None:
+def test_the_diagnostics_tell_latency_and_counts(start: Start) -> None:
     node = start()
     assert report(node).level == 1  # no clouds
 
@@ -220,7 +224,7 @@ def test_the_diagnostics_tell_latency_and_counts(start: Callable[..., Any]) -> N
     assert float(values["latency (ms)"]) > 0
 
 
-def test_the_classes_are_published_once_for_late_subscribers(start: Callable[..., Any]) -> None:
+def test_the_classes_are_published_once_for_late_subscribers(start: Start) -> None:
     publisher = start().publishers["~/classes"]
     (message,) = publisher.messages
     classes = json.loads(message.data)
@@ -232,7 +236,7 @@ def test_the_classes_are_published_once_for_late_subscribers(start: Callable[...
 
 @pytest.mark.parametrize(("sensor", "name"), [("hdl32e", "sim-hdl32e"), ("", "sim-hdl64e")])
 def test_the_first_cloud_chooses_the_weights_and_their_classes(
-    start: Callable[..., Any], sensor: str, name: str
+    start: Start, sensor: str, name: str
 ) -> None:
     node = start(weights="auto", sensor=sensor)
     assert not node.publishers["~/classes"].messages
@@ -249,7 +253,7 @@ def test_the_first_cloud_chooses_the_weights_and_their_classes(
     assert name in lines[0]
 
 
-def test_clouds_have_the_quality_of_service_of_sensor_data(start: Callable[..., Any]) -> None:
+def test_clouds_have_the_quality_of_service_of_sensor_data(start: Start) -> None:
     node = start()
     _, qos = node.callbacks["points"]
     for profile in (qos, node.publishers["~/labels"].qos, node.publishers["~/cloud"].qos):
@@ -258,7 +262,7 @@ def test_clouds_have_the_quality_of_service_of_sensor_data(start: Callable[..., 
         assert profile.depth == 1
 
 
-def test_what_a_topic_overrides_does_not_change_the_others(start: Callable[..., Any]) -> None:
+def test_what_a_topic_overrides_does_not_change_the_others(start: Start) -> None:
     node = start()
     node.publishers["~/cloud"].qos.reliability = "reliable"  # as rclpy does
     _, qos = node.callbacks["points"]
@@ -266,7 +270,7 @@ def test_what_a_topic_overrides_does_not_change_the_others(start: Callable[..., 
 
 
 def test_an_error_of_the_program_ends_the_node_with_its_traceback(
-    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise ZeroDivisionError("of the test")
@@ -311,7 +315,7 @@ def test_a_wrong_parameter_is_one_line_and_exit_code_2(
     assert words in error
 
 
-def test_the_sensor_is_described_as_for_predict(start: Callable[..., Any]) -> None:
+def test_the_sensor_is_described_as_for_predict(start: Start) -> None:
     node = start(sensor="vlp16", height=0.9, axes="y-forward", intensity_scale=255.0)
     sensor = node._segment._sensor
     assert (sensor.name, sensor.beams) == ("vlp16", 16)
@@ -321,7 +325,7 @@ def test_the_sensor_is_described_as_for_predict(start: Callable[..., Any]) -> No
     assert start(height=0.0)._segment._sensor.height == 0
 
 
-def test_what_is_assumed_of_the_sensor_is_logged_once(start: Callable[..., Any]) -> None:
+def test_what_is_assumed_of_the_sensor_is_logged_once(start: Start) -> None:
     node = start()
     for seed in range(3):
         send(node, ros_message(scan(seed)))
@@ -343,11 +347,7 @@ class Drive:
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    messages = []
-    for sent in drive_clouds(DRIVE_SCANS):
-        message = sent.make(STORE)
-        message.data = array("B", message.data.tobytes())
-        messages.append(message)
+    messages = [as_rclpy_gives_it(sent.make(STORE)) for sent in drive_clouds(DRIVE_SCANS)]
     odometry = drive_odometry(DRIVE_SCANS)
     return Drive(messages, {round(sent.time * 1e9): pose_at(sent.time) for sent in odometry})
 
@@ -365,7 +365,14 @@ def label_all(node: Any, messages: list[Any]) -> list[np.ndarray]:
     return labels_of(node)
 
 
-def alone(start: Callable[..., Any], messages: list[Any]) -> list[np.ndarray]:
+def fusing(start: Start, drive: Drive, **changes: Any) -> Any:
+    """Start a node that fuses scans and has the odometry of the whole drive."""
+    node = start(**{"odom_frame": "odom", **SENSOR, **changes})
+    node._frames.poses |= drive.poses
+    return node
+
+
+def alone(start: Start, messages: list[Any]) -> list[np.ndarray]:
     return label_all(start(**SENSOR), messages)
 
 
@@ -374,7 +381,7 @@ def warnings_of(node: Any) -> list[str]:
 
 
 def test_scans_are_fused_with_past_scans_as_by_predict_on_a_bag(
-    start: Callable[..., Any], weights: Path, tmp_path: Path, drive: Drive
+    start: Start, weights: Path, tmp_path: Path, drive: Drive
 ) -> None:
     sent = [*drive_odometry(DRIVE_SCANS), *drive_clouds(DRIVE_SCANS)]
     bag = write_bag(tmp_path / "bag", sent)
@@ -383,8 +390,7 @@ def test_scans_are_fused_with_past_scans_as_by_predict_on_a_bag(
         options += f" --{name.replace('_', '-')} {value}"
     succeed(f"predict {bag} --weights {weights} --out {tmp_path / 'out'} {options}")
 
-    node = start(odom_frame="odom", **SENSOR)
-    node._frames.poses |= drive.poses
+    node = fusing(start, drive)
     for number, labels in enumerate(label_all(node, drive.messages)):
         np.testing.assert_array_equal(labels, np.load(tmp_path / f"out/bag/{number:06d}.npy"))
     assert not warnings_of(node)
@@ -394,30 +400,25 @@ def test_scans_are_fused_with_past_scans_as_by_predict_on_a_bag(
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1000), ("ft", 1 / 0.3048)])
 def test_scans_in_another_unit_are_fused_as_those_in_metres(
-    start: Callable[..., Any], drive: Drive, unit: str, factor: float
+    start: Start, drive: Drive, unit: str, factor: float
 ) -> None:
     scale = np.array([factor, factor, factor, 1], np.float32)
     messages = []
     for index, (points, _) in enumerate(drive_scans(DRIVE_SCANS)):
         message = cloud(FIRST + PERIOD * index, points * scale).make(STORE)
-        message.data = array("B", message.data.tobytes())
-        messages.append(message)
+        messages.append(as_rclpy_gives_it(message))
     found = []
     for sent, stated in ((messages, unit), (drive.messages, "m")):
-        node = start(**{**SENSOR, "odom_frame": "odom", "unit": stated})
-        node._frames.poses |= drive.poses
-        found.append(np.concatenate(label_all(node, sent)))
+        found.append(np.concatenate(label_all(fusing(start, drive, unit=stated), sent)))
     assert np.mean(found[0] == found[1]) > 0.99
     alone_labels = np.concatenate(alone(start, drive.messages))
     assert np.mean(found[0] == alone_labels) < 0.9
 
 
 def test_odometry_that_comes_while_a_scan_is_labelled_counts(
-    start: Callable[..., Any], drive: Drive, monkeypatch: pytest.MonkeyPatch
+    start: Start, drive: Drive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    early = start(odom_frame="odom", **SENSOR)
-    early._frames.poses |= drive.poses
-    expected = label_all(early, drive.messages[:3])
+    expected = label_all(fusing(start, drive), drive.messages[:3])
 
     node = start(odom_frame="odom", **SENSOR)
     score = TorchEngine.score
@@ -432,7 +433,7 @@ def test_odometry_that_comes_while_a_scan_is_labelled_counts(
 
 
 def test_without_odometry_scans_are_labelled_alone_with_a_warning(
-    start: Callable[..., Any], drive: Drive
+    start: Start, drive: Drive
 ) -> None:
     messages = drive.messages[:3]
     expected = alone(start, messages)
@@ -441,8 +442,7 @@ def test_without_odometry_scans_are_labelled_alone_with_a_warning(
     assert len(warnings_of(node)) == 3  # rclpy throttles them
     assert "extrapolation" in warnings_of(node)[0]
 
-    node = start(odom_frame="map", **SENSOR)  # tf does not know it
-    node._frames.poses |= drive.poses
+    node = fusing(start, drive, odom_frame="map")  # tf does not know it
     np.testing.assert_array_equal(label_all(node, messages), expected)
     assert not any("\n" in line for line in warnings_of(node))
 
@@ -454,15 +454,13 @@ def test_without_odometry_scans_are_labelled_alone_with_a_warning(
     assert "quaternions" in warnings_of(node)[0]
 
 
-def test_a_scan_without_odometry_stops_nothing(start: Callable[..., Any], drive: Drive) -> None:
+def test_a_scan_without_odometry_stops_nothing(start: Start, drive: Drive) -> None:
     """The scans around it are fused as if it were not there."""
-    node = start(odom_frame="odom", **SENSOR)
-    node._frames.poses |= drive.poses
+    node = fusing(start, drive)
     first, lost, last = drive.messages[:3]
     expected = label_all(node, [first, last])
 
-    node = start(odom_frame="odom", **SENSOR)
-    node._frames.poses |= drive.poses
+    node = fusing(start, drive)
     send(node, first)
     node._frames.frames = ("odom", "elsewhere")
     send(node, lost)
@@ -471,9 +469,8 @@ def test_a_scan_without_odometry_stops_nothing(start: Callable[..., Any], drive:
     np.testing.assert_array_equal(labels_of(node)[::2], expected)
 
 
-def test_a_bag_played_twice_has_the_same_labels(start: Callable[..., Any], drive: Drive) -> None:
-    node = start(odom_frame="odom", **SENSOR)
-    node._frames.poses |= drive.poses
+def test_a_bag_played_twice_has_the_same_labels(start: Start, drive: Drive) -> None:
+    node = fusing(start, drive)
     first = label_all(node, drive.messages[:4])
     send(node, drive.messages[0])  # its odometry is not there yet
     assert len(warnings_of(node)) == 1
@@ -481,19 +478,17 @@ def test_a_bag_played_twice_has_the_same_labels(start: Callable[..., Any], drive
     np.testing.assert_array_equal(labels_of(node)[4], alone(start, drive.messages[:1])[0])
     again = label_all(node, drive.messages[1:4])[5:]
 
-    fresh = start(odom_frame="odom", **SENSOR)
-    fresh._frames.poses |= drive.poses
+    fresh = fusing(start, drive)
     np.testing.assert_array_equal(again, label_all(fresh, drive.messages[1:4]))
     assert len(first) == 4
 
 
 def test_odometry_that_jumps_starts_anew(
-    start: Callable[..., Any], drive: Drive, monkeypatch: pytest.MonkeyPatch
+    start: Start, drive: Drive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The jump shows only after the networks have seen the scan, turned or not.
     monkeypatch.setattr("amvnet.inference.drive.TURN", 0.0)
-    fresh = start(odom_frame="odom", **SENSOR)
-    fresh._frames.poses |= drive.poses
+    fresh = fusing(start, drive)
     expected = label_all(fresh, drive.messages[2:4])
 
     node = start(odom_frame="odom", **SENSOR)

@@ -50,10 +50,7 @@ def trained_at(height: float, root: Path) -> Weights:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    "height",
-    [0.8, pytest.param(1.73, marks=pytest.mark.full), pytest.param(2.6, marks=pytest.mark.full)],
-)
+@pytest.mark.parametrize("height", [0.8, 1.73, 2.6])
 def test_datasets_folders_files_and_bags_get_the_same_labels(height: float, tmp_path: Path) -> None:
     weights = trained_at(height, tmp_path / "data")
     save(weights, tmp_path / "w.safetensors")
@@ -61,21 +58,14 @@ def test_datasets_folders_files_and_bags_get_the_same_labels(height: float, tmp_
     clouds = [np.fromfile(path, np.float32).reshape(-1, 4) for path in scans]
     write_bag1(tmp_path / "drive.bag", {"/points": clouds})
 
-    for inputs, out in (
-        ([tmp_path / "data"], "dataset"),
-        ([scans[0].parent], "folder"),
-        ([scans[0]], "first"),
-        ([scans[1]], "second"),
-        ([tmp_path / "drive.bag"], "bag"),
-    ):
-        succeed(
-            *("predict", *inputs, "--weights", tmp_path / "w.safetensors", "--out", tmp_path / out)
-        )
+    inputs = {"dataset": tmp_path / "data", "folder": scans[0].parent}
+    inputs |= {"first": scans[0], "second": scans[1], "bag": tmp_path / "drive.bag"}
+    for out, path in inputs.items():
+        succeed(f"predict {path} --weights {tmp_path}/w.safetensors --out {tmp_path}/{out}")
 
     for index, path in enumerate(scans):
-        expected = np.fromfile(
-            tmp_path / f"dataset/sequences/08/predictions/{path.stem}.label", np.uint32
-        )
+        written = tmp_path / f"dataset/sequences/08/predictions/{path.stem}.label"
+        expected = np.fromfile(written, np.uint32)
         assert len(np.unique(expected)) > 1
         others = [f"folder/{path.stem}.label", f"bag/drive/{index:06d}.label"]
         if index < 2:

@@ -20,7 +20,7 @@ from amvnet.files import alone_in
 from amvnet.scan import Scan
 from amvnet.training.stage import WholeCheckpoints
 
-from fixtures.commands import files, refused, succeed
+from fixtures.commands import contents, files, refused, succeed
 from fixtures.tiny import make_streets, write_recipe
 
 
@@ -73,10 +73,10 @@ def test_a_stage_is_trained_by_one_call_at_a_time(world: Path, tmp_path: Path, s
     out = tmp_path / "run"
     succeed(command(world, out, "--stage bev"))
     with alone_in(out, ".rv.lock"):  # as a call that trains the range view has it
-        before = {name: (out / name).read_bytes() for name in files(out)}
+        before = contents(out)
         options = f"--stage {stage} --resume --training.seed 2 --training.bev.epochs 1"
         refused(command(world, out, options), "another run")
-        assert {name: (out / name).read_bytes() for name in files(out)} == before
+        assert contents(out) == before
         succeed(command(world, out, "--stage bev --resume"))
     succeed(command(world, out, "--resume"))
     assert not [name for name in files(out) if "lock" in name]

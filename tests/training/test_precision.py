@@ -1,6 +1,5 @@
 """The precision that `auto` stands for, and trainings in mixed precision on the CPU."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from amvnet.training.stage import precision_of
 from amvnet.weights.file import load, save
 
 from fixtures.commands import run_cli
-from fixtures.tiny import GOLDEN, fresh_weights, make_streets, write_recipe
+from fixtures.tiny import GOLDEN, fresh_weights, make_streets, with_model, write_recipe
 
 MIXED = ("bf16-mixed", "16-mixed")
 AUTO = TrainingConfig(precision="auto")
@@ -41,9 +40,7 @@ def test_a_torch_that_does_not_tell_trains_in_32_bits(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("includes_bfloat16", [True, False])
-def test_a_gpu_is_asked_without_emulation(
-    monkeypatch: pytest.MonkeyPatch, includes_bfloat16: bool
-) -> None:
+def test_a_gpu_emulates_nothing(monkeypatch: pytest.MonkeyPatch, includes_bfloat16: bool) -> None:
     def is_bf16_supported(including_emulation: bool = True) -> bool:
         return including_emulation or includes_bfloat16
 
@@ -87,10 +84,8 @@ def test_each_stage_of_each_recipe_trains_and_resumes_in_mixed_precision(
         words += [GOLDEN / "nuscenes", "--train-sequences", "scene-0103"]
         words += ["--val-sequences", "scene-0916"]
     if load_recipe(recipe).from_init:
-        start = fresh_weights()
         # The built-in weights show hidden points as well.
-        view = replace(start.model.range_view, width=WIDTH, hidden=0.5)
-        start = replace(start, model=replace(start.model, range_view=view))
+        start = with_model(fresh_weights(), "range_view", width=WIDTH, hidden=0.5)
         save(start, tmp_path / "start.safetensors")
         words += ["--init", tmp_path / "start.safetensors"]
 

@@ -38,7 +38,7 @@ from amvnet.training.networks import NetworkStage, train_network
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.commands import files, refusal, refused, run_cli, succeed
+from fixtures.commands import contents, files, refusal, refused, run_cli, succeed
 from fixtures.processes import Printed, become_cli, fork_server, start_cli
 from fixtures.tiny import (
     BUILDING,
@@ -115,9 +115,7 @@ def run(world: Path) -> Path:
 
 
 @STAGES
-def test_a_stage_writes_its_curves_and_the_weights_of_the_highest_miou(
-    run: Path, stage: str
-) -> None:
+def test_a_stage_writes_its_curves_and_weights_of_the_highest_miou(run: Path, stage: str) -> None:
     names = files(run / stage)
     assert {"best.safetensors", "last.safetensors"} <= names
     assert any(name.startswith("events.out.tfevents") for name in names)
@@ -468,9 +466,9 @@ def test_a_finished_stage_needs_no_checkpoint(world: Path, run: Path, tmp_path: 
     shutil.copytree(run, out)
     for stage in PART_OF:
         (out / stage / "last.ckpt").unlink()
-    before = {path: (out / path).read_bytes() for path in files(out)}
+    before = contents(out)
     refused((*train_arguments(world, out),), "--resume")
-    assert {path: (out / path).read_bytes() for path in files(out)} == before
+    assert contents(out) == before
     assert not differing(train(world, out, "--resume"), load(run))
 
 

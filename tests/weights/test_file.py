@@ -20,10 +20,10 @@ import amvnet.weights
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import PARTS
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.errors import InputError
 from amvnet.weights.file import Weights, built_in, load, save
 
-from fixtures.tiny import fresh_weights, street
+from fixtures.commands import fails
+from fixtures.tiny import fresh_weights, street, with_model
 
 POINTS = street(9)[0]
 
@@ -96,27 +96,14 @@ def test_float16_parameters_hardly_change_the_scores(weights: Weights, tmp_path:
 
 
 def test_parameters_that_do_not_fit_their_sizes_are_refused(weights: Weights) -> None:
-    config = replace(weights.model, range_net=replace(weights.model.range_net, stem=32))
-    with pytest.raises(InputError, match="range_net"):
-        replace(weights, model=config).build()
+    fails(lambda: with_model(weights, "range_net", stem=32).build(), "range_net")
 
 
 # --- files that are not weights ---
 
 
-def read_description(content: bytes) -> dict[str, Any]:
-    size = int.from_bytes(content[:8], "little")
-    header = json.loads(content[8 : 8 + size])
-    return json.loads(header["__metadata__"]["amvnet"])
-
-
 def save_described(path: Path, description: Any) -> None:
     save_file({"range_net.a": torch.zeros(2)}, path, metadata={"amvnet": json.dumps(description)})
-
-
-def save_changed(path: Path, content: bytes, **changes: object) -> None:
-    """Write a safetensors file with some fields of a good description changed."""
-    save_described(path, {**read_description(content), **changes})
 
 
 # How to write a broken file, given its path and the content of a good one.
@@ -129,10 +116,7 @@ BROKEN = {
     "pickle": lambda path, content: torch.save({"range_net.a": torch.zeros(2)}, path),
     "without description": lambda path, content: save_file({"range_net.a": torch.zeros(2)}, path),
     "description of another kind": lambda path, content: save_described(path, ["format"]),
-    "another format": lambda path, content: save_described(path, {"format": 99}),
     "only the format": lambda path, content: save_described(path, {"format": 1}),
-    "model of another kind": lambda path, content: save_changed(path, content, model=5),
-    "no taxonomy": lambda path, content: save_changed(path, content, taxonomy={}),
 }
 
 
@@ -140,9 +124,7 @@ BROKEN = {
 def test_a_file_that_is_no_weights_is_one_line(kind: str, path: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.safetensors"
     BROKEN[kind](broken, path.read_bytes())
-    with pytest.raises(InputError) as error:
-        load(broken)
-    assert "\n" not in str(error.value)
+    fails(lambda: load(broken))
 
 
 @pytest.mark.parametrize(

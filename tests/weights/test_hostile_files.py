@@ -91,6 +91,7 @@ MODEL: dict[str, tuple[str, Any]] = {
 
 # The same for the other fields of the description.
 DESCRIPTION: dict[str, tuple[str, Any]] = {
+    "model as a number": ("model", 5),
     "no taxonomy": ("taxonomy", {}),
     "raw ids as text": ("taxonomy train_to_raw 3", "ten"),
     "raw ids as fractions": ("taxonomy train_to_raw 3", 1.5),
