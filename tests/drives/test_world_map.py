@@ -22,9 +22,9 @@ from amvnet.files import alone_in, digest
 from amvnet.inference import drive as drive_module
 from amvnet.inference.drive import Drives
 from amvnet.inference.listing import find_inputs
-from amvnet.inference.reading import Reading
 from amvnet.inference.request import LabellingRequest
 from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.reading import Reading
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import read_page

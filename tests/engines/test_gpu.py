@@ -27,7 +27,6 @@ from amvnet.engines.streams import TwoStreams
 from amvnet.inference.journal import Entry, Journal
 from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
-from amvnet.inference.reading import AS_FOUND
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import LateFusion
@@ -36,6 +35,7 @@ from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
 from amvnet.models.views.points import PointBatch
 from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.reading import AS_FOUND
 from amvnet.weights.file import Weights, save
 
 from fixtures.commands import fails, files, refused, run_cli

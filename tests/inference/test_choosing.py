@@ -13,11 +13,11 @@ import amvnet
 from amvnet.data.formats import find
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.inference.listing import find_inputs
-from amvnet.inference.reading import Reading
 from amvnet.sensors import measure
 from amvnet.sensors.built_in import lasers_of, weights_for
 from amvnet.sensors.lasers import SensorGeometry
 from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, make_sensor
+from amvnet.sensors.reading import Reading
 
 from fixtures.commands import fails, files, refused, succeed
 from fixtures.datasets import make_nuscenes, make_semantickitti

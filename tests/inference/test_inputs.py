@@ -23,13 +23,13 @@ from amvnet.data.recordings import Recording
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import find_inputs
 from amvnet.inference.predict import ADVICE, report_certainty
-from amvnet.inference.reading import array_cloud, array_scan
 from amvnet.scan import Scan
 from amvnet.sensors import normalise
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.measure import MEASURED_SCANS
 from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.reading import array_cloud, array_scan
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import Weights, save
 

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
     from amvnet.inference.drive import DriveOptions
     from amvnet.inference.listing import Inputs
-    from amvnet.inference.reading import Reading
     from amvnet.inference.request import LabellingRequest
     from amvnet.inference.scores import ScorePair
     from amvnet.inference.segmenter import Segmenter
     from amvnet.runtime.distributed import Processes
+    from amvnet.sensors.reading import Reading
     from amvnet.weights.file import Weights
 
 # Only nuScenes has the last two splits.
@@ -62,7 +62,7 @@ class ScanChoice:
             InputError: if a value cannot be parsed; or as `SensorChoice.parse`.
         """
         from amvnet.data.formats.rows import parse_layout
-        from amvnet.inference.reading import Reading
+        from amvnet.sensors.reading import Reading
 
         layout = parse_layout(self.columns, self.dtype)
         described = UNKNOWN_SENSOR if sensor is None else sensor.parse()

@@ -37,12 +37,12 @@ from amvnet.inference.listing import Inputs
 from amvnet.inference.loading import load_with
 from amvnet.inference.pipeline import Pipeline
 from amvnet.inference.predict import segment_by
-from amvnet.inference.reading import Reading
 from amvnet.inference.request import LabellingRequest
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.inference.segmentation import Segmentation
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.normalise import Normalised, Normaliser
+from amvnet.sensors.reading import Reading
 
 TRANSFERS = 8  # number of files that are fetched from object storage at the same time
 # The column that says whether an error stops the run, because no labels can be written.

@@ -31,10 +31,10 @@ from amvnet.fleet.storage import Place
 from amvnet.inference.journal import Entry
 from amvnet.inference.pipeline import check_faults
 from amvnet.inference.predict import report_certainty
-from amvnet.inference.reading import Reading
 from amvnet.inference.request import LabellingRequest
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.sensors.measure import MEASURED_SCANS
+from amvnet.sensors.reading import Reading
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
 # Workers get the niceness of `predict`; Ray's default is 15.

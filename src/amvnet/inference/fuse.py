@@ -17,7 +17,6 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import Inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults, check_output
-from amvnet.inference.reading import checked_scan
 from amvnet.inference.scores import LEAST_PROBABILITY, ScorePair, as_probabilities, have_opinion
 from amvnet.inference.segmentation import Segmentation, fetch, unpack
 from amvnet.models.amvnet import LateFusion, Scores
@@ -29,6 +28,7 @@ from amvnet.scan import AnyArray, Scan, as_array
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Normaliser
+from amvnet.sensors.reading import checked_scan
 from amvnet.weights.file import Weights, load
 
 Head = PointHead | Weights | Path | str | None

@@ -16,7 +16,6 @@ from amvnet.data.formats.find import list_scans
 from amvnet.data.recordings import Recording, ScanFile, by_recording, name_apart
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.reading import AS_FOUND, Reading
 from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.built_in import lasers_of, weights_for
@@ -25,6 +24,7 @@ from amvnet.sensors.lidars import KNOWN_HEIGHTS
 from amvnet.sensors.measure import MEASURED_SCANS, Estimate, Measured
 from amvnet.sensors.normalise import Normaliser, described_sensor, normalised
 from amvnet.sensors.own_body import mark_own
+from amvnet.sensors.reading import AS_FOUND, Reading
 from amvnet.weights.file import Weights
 
 MEASURED_HEIGHT = KNOWN_HEIGHTS["hdl64e"]  # of a sensor whose scans lie on the ground, metres

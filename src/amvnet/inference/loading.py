@@ -19,7 +19,6 @@ from amvnet.engines.precision import resolved
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.inference.listing import Inputs
-from amvnet.inference.reading import AS_FOUND, Reading, array_cloud
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method
@@ -28,6 +27,7 @@ from amvnet.scan import AnyArray, Scan
 from amvnet.sensors.built_in import weights_for
 from amvnet.sensors.lasers import SensorGeometry
 from amvnet.sensors.lidars import AUTO, Sensor, make_sensor
+from amvnet.sensors.reading import AS_FOUND, Reading, array_cloud
 from amvnet.weights.file import Weights
 from amvnet.weights.file import load as load_weights
 

@@ -12,7 +12,6 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.engines.base import Engine
 from amvnet.errors import InputError
 from amvnet.inference.listing import Inputs, find_inputs
-from amvnet.inference.reading import AS_FOUND, Reading, array_cloud, array_scan
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName
@@ -21,6 +20,7 @@ from amvnet.runtime.memory import return_freed_memory
 from amvnet.scan import AnyArray, Scan, check_scan, turned
 from amvnet.sensors.normalise import Normaliser
 from amvnet.sensors.own_body import mark_own
+from amvnet.sensors.reading import AS_FOUND, Reading, array_cloud, array_scan
 from amvnet.weights.file import Weights
 
 # The least number of points in a batch whose freed memory is returned to the system, because no

@@ -25,11 +25,11 @@ from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.evaluation.metrics import OVERALL, Evaluation
 from amvnet.files import atomic_write, unfinished
-from amvnet.inference.reading import checked_scan
 from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
 from amvnet.outputs import Signature, check_outputs
 from amvnet.scan import AnyArray, Scan
+from amvnet.sensors.reading import checked_scan
 from amvnet.viewing.shown_scans import CORRECT, UNSCORED, ShownScan, short_name, shown_scan
 
 # Largest number of points of a scan that the page shows. The page shows every second or third point
