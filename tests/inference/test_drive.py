@@ -17,6 +17,7 @@ import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.poses import Poses
 from amvnet.data.recordings import Recording, ScanFile
+from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.drives.consensus import REACH
 from amvnet.drives.odometry import Odometry, Pair, check_fit
 from amvnet.errors import InputError
@@ -398,6 +399,37 @@ def test_evaluate_scores_the_labels_that_predict_writes(world: Path, tmp_path: P
         figures[name] = json.loads((tmp_path / f"{name}.json").read_text())["methods"][name]
     assert figures["drive"] == figures["predictions"]
     refused(f"evaluate {data} --predictions {world}/labels --drive", "--weights")
+
+
+def test_evaluate_fuses_scans_in_other_axes_as_predict_does(world: Path, tmp_path: Path) -> None:
+    for folder in ("scans", "labels"):
+        (tmp_path / folder).mkdir()
+    for index, (points, raw) in enumerate(drive_scans()):
+        right_forward = np.column_stack((-points[:, 1], points[:, 0], points[:, 2:]))
+        np.save(tmp_path / f"scans/{index:04d}.npy", right_forward)
+        raw.astype(np.uint32).tofile(tmp_path / f"labels/{index:04d}.label")
+    turn = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    np.savetxt(tmp_path / "poses.txt", (POSES @ turn)[:, :3].reshape(-1, 12))
+    ids = dict(zip(SEMANTICKITTI.classes, SEMANTICKITTI.train_to_raw[1:], strict=True))
+    lines = [
+        f"classes: {json.dumps(ids)}",
+        "scans: scans/*.npy",
+        "labels: ../labels/{name}.label",
+        "poses: ../poses.txt",
+        "sensor: {axes: y-forward}",
+    ]
+    data = tmp_path / "own.yaml"
+    data.write_text("\n".join(lines))
+
+    succeed(predict(world, tmp_path / "out", data=data))
+    figures = {}
+    for name, source in (
+        ("drive", f"--weights {world}/w.safetensors --drive"),
+        ("predictions", f"--predictions {tmp_path}/out"),
+    ):
+        succeed(f"evaluate {data} --split all {source} --json {tmp_path}/{name}.json")
+        figures[name] = json.loads((tmp_path / f"{name}.json").read_text())["methods"][name]
+    assert figures["drive"] == figures["predictions"]
 
 
 # ---- poses of a bag

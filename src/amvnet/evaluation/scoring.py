@@ -162,8 +162,7 @@ def _with_consensus(labelled: Iterator[ByMethods], drives: Drives) -> Iterator[B
 def _drive_scan(item: ByMethods, drives: Drives) -> DriveScan[ByMethods]:
     record, scan, labels = item
     assert labels.turned is not None
-    pose = drives.poses[record]
-    return DriveScan(item, scan.points[:, :3], labels.turned, pose)
+    return DriveScan(item, scan.points[:, :3], labels.turned, drives.motion(record, scan))
 
 
 def pictures_of(records: Sequence[ScanFile], folder: Path) -> dict[Path, Signature]:
