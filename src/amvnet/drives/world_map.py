@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from amvnet.data.class_maps import class_map
 from amvnet.data.formats.registry import check_packages
-from amvnet.data.labels.clouds import COLORS, write_cloud
-from amvnet.data.labels.legend import legend_of
-from amvnet.data.palette import class_colors
+from amvnet.data.labels.clouds import Columns, write_cloud
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.drives.consensus import (
@@ -86,14 +84,10 @@ class WorldMap:
             InputError: if the ending is another one, or laspy is missing.
         """
         check_ending(path)
-        colors = np.asarray(class_colors(self.taxonomy), np.uint8)[self.labels]
-        columns = dict(zip("xyz", self.xyz.T, strict=True))
-        columns |= dict(zip(COLORS, colors.T, strict=True))
-        columns["class"] = self.taxonomy.to_raw(self.labels).astype(np.int32)
-        columns["confidence"] = self.confidence
-        columns["sights"] = self.sights
+        xyz: Columns = dict(zip("xyz", self.xyz.T, strict=True))
+        others: Columns = {"confidence": self.confidence, "sights": self.sights}
         with atomic_write(path) as part:
-            write_cloud(part, path.suffix, columns, legend_of(self.taxonomy), PROGRAM)
+            write_cloud(part, xyz, self.labels, self.taxonomy, others, program=PROGRAM)
 
 
 class MapBuilder:

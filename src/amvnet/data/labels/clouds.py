@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.formats import las, pcd, ply
+from amvnet.data.labels.legend import legend_of
+from amvnet.data.palette import class_colors
+from amvnet.data.taxonomy import Taxonomy
 
 Columns = dict[str, np.ndarray]
 
@@ -29,25 +32,36 @@ FARTHEST = 1_000_000.0  # largest coordinate, metres, from which 32 bits of mill
 
 
 def write_cloud(
-    path: Path, ending: str, columns: Columns, legend: Sequence[str], program: str = "amvnet"
+    path: Path,
+    coordinates: Columns,
+    ids: np.ndarray,
+    taxonomy: Taxonomy,
+    others: Columns,
+    program: str = "amvnet",
 ) -> None:
-    """Write points in the format of an ending.
+    """Write labelled points as .ply, .pcd, .las or .laz; the file also names the classes.
+
+    The columns are x, y and z; red, green and blue of the class, uint8; class, its raw id, int32;
+    and the others. LAS has coordinates in millimetres, lost points (NaN) at 0, 0, 0 (in map
+    coordinates, at their lowest corner), and the class as `classification` if all ids are below
+    256, else as a dimension of its own.
 
     Args:
-        ending: .ply, .pcd, .las or .laz.
-        columns: (N,) x, y and z in metres; red, green and blue, uint8; class, int32; and any
-            others. LAS has coordinates in millimetres, lost points (NaN) at 0, 0, 0 (in map
-            coordinates, at their lowest corner), and the class as `classification` if all ids are
-            below 256, else as a dimension of its own.
-        legend: the lines that name the classes (`legend_of`).
+        coordinates: (N,) x, y and z in metres.
+        ids: (N,) train ids.
         program: what LAS says of the program that wrote the file.
     """
-    if ending == ".ply":
+    colors = np.asarray(class_colors(taxonomy), np.uint8)[ids]
+    columns = coordinates | dict(zip(COLORS, colors.T, strict=True))
+    columns["class"] = taxonomy.to_raw(ids).astype(np.int32)
+    columns |= others
+    legend = legend_of(taxonomy)
+    if path.suffix == ".ply":
         _write_ply(path, columns, legend)
-    elif ending == ".pcd":
+    elif path.suffix == ".pcd":
         _write_pcd(path, columns, legend)
     else:
-        _write_las(path, columns, legend, program, packed=ending == ".laz")
+        _write_las(path, columns, legend, program, packed=path.suffix == ".laz")
 
 
 def _write_ply(path: Path, columns: Columns, legend: Sequence[str]) -> None:

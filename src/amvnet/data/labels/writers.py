@@ -10,10 +10,8 @@ from typing import get_args
 import numpy as np
 
 from amvnet.data.formats.registry import check_packages
-from amvnet.data.labels.clouds import COLORS, PCD_HEADER, Columns, write_cloud
+from amvnet.data.labels.clouds import PCD_HEADER, Columns, write_cloud
 from amvnet.data.labels.ids import check_count, write_array, write_ids
-from amvnet.data.labels.legend import legend_of
-from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -102,20 +100,15 @@ def write_scan_labels(
             write_array(part, raw)
             return path
 
-        columns = _coordinates(xyz)
-        if kind == "csv":
-            columns |= {"class": raw, "name": np.asarray(taxonomy.names)[ids]}
-            if uncertain is not None:
-                columns["uncertain"] = np.asarray(uncertain).astype(np.uint8)
-            _write_table(part, columns)
-            return path
-
-        colors = np.asarray(class_colors(taxonomy), dtype=np.uint8)[ids]
-        columns |= dict(zip(COLORS, colors.T, strict=True))
-        columns["class"] = raw.astype(np.int32)
+        points = _coordinates(xyz)
+        others: Columns = {}
         if uncertain is not None:
-            columns["uncertain"] = np.asarray(uncertain).astype(np.uint8)
-        write_cloud(part, path.suffix, columns, legend_of(taxonomy))
+            others["uncertain"] = np.asarray(uncertain).astype(np.uint8)
+        if kind == "csv":
+            names = np.asarray(taxonomy.names)[ids]
+            _write_table(part, points | {"class": raw, "name": names} | others)
+        else:
+            write_cloud(part, points, ids, taxonomy, others)
     return path
 
 
