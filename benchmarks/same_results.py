@@ -420,9 +420,9 @@ def flatten(tree: Any, prefix: str = "") -> dict[str, Part]:
 
 
 def read_journal(path: Path) -> dict[str, Part]:
-    """Read the rows of a journal without the digests of the scans' times, which are second."""
+    """Read the rows of a journal without the scans' times and places, their second and eighth."""
     head, *rows = map(json.loads, path.read_text().splitlines())
-    return flatten(head) | {name: json.dumps(values) for name, _, *values in rows}
+    return flatten(head) | {name: json.dumps(values[:5]) for name, _, *values in rows}
 
 
 def read_table(path: Path) -> dict[str, Part]:
