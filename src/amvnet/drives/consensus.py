@@ -22,7 +22,7 @@ STEPS = 16
 _BITS = 21  # bits of a voxel's place along one axis
 LARGEST_INDEX = 1 << (_BITS - 1)  # voxels in so many places on each side have keys of their own
 
-NOTHING = (np.empty((0, 0), np.float32), np.empty(0, np.int32))  # the consensus on no points
+NOTHING = np.empty((0, 0), np.float32)  # the consensus on no points
 
 Item = TypeVar("Item")
 
@@ -72,10 +72,6 @@ class VoxelTable:
         means: NDArray[np.float32] = sums[:, :-1] / sums[:, -1:]
         return means
 
-    def scans(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the number of scans (M,) that see each voxel."""
-        return self._scans[self.rows(keys)]
-
     def contents(self) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
         """Return all voxels: their keys (V,), sums (V, C) and numbers of scans (V,)."""
         return self._keys, self._sums[self._rows], self._scans[self._rows]
@@ -122,12 +118,10 @@ class Fused(NamedTuple, Generic[Item]):
 
     Attributes:
         scores: (N, K) float32 fused probabilities; the rows of points without scores are 0.
-        sights: (N,) int32 number of scans in reach that see the small voxel of each point.
     """
 
     item: Item
     scores: NDArray[np.float32]
-    sights: NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -197,7 +191,7 @@ class Consensus:
                 continue
 
             item, seen = window[place]
-            yield Fused(item, *(NOTHING if seen is None else self._fuse(seen)))
+            yield Fused(item, NOTHING if seen is None else self._fuse(seen))
             if place < self.reach:
                 place += 1
                 continue
@@ -224,10 +218,8 @@ class Consensus:
             inverse=(inverse, parent),
         )
 
-    def _fuse(self, seen: _Seen) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Return the fused probabilities and the sights of a scan whose reach is in the tables."""
-        sights = np.zeros(len(seen.logs), np.int32)
-        sights[seen.is_fused] = self._tables[0].scans(seen.keys[0])[seen.inverse[0]]
+    def _fuse(self, seen: _Seen) -> NDArray[np.float32]:
+        """Return the fused probabilities of a scan whose reach is in the tables."""
         means = self._tables[0].means(seen.keys[0])
         means += self._tables[1].means(seen.keys[1])[seen.inverse[1]]
         fused = torch.from_numpy(means).mul_((1 - OWN) / 2)
@@ -241,11 +233,11 @@ class Consensus:
         fused.div_(STEPS).exp_()
         fused.div_(fused.sum(dim=1, keepdim=True))
         if is_whole:
-            return fused.numpy(), sights
+            return fused.numpy()
 
         probabilities = torch.zeros_like(logs)
         probabilities[is_fused] = fused
-        return probabilities.numpy(), sights
+        return probabilities.numpy()
 
 
 def weighted_logs(

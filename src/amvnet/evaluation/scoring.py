@@ -152,7 +152,7 @@ def evaluate(
 def _with_consensus(labelled: Iterator[ByMethods], drives: Drives) -> Iterator[ByMethods]:
     """Add the labels by `DRIVE` to the labels of scans, which are in the order of their drives."""
     for _, drive in groupby(labelled, key=lambda item: item[0].recording):
-        for (record, scan, labels), scores, _ in drives.consensus().stream(
+        for (record, scan, labels), scores in drives.consensus().stream(
             _drive_scan(item, drives) for item in drive
         ):
             ids = np.where(scores.any(axis=1), scores.argmax(axis=1) + 1, 0)

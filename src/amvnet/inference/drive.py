@@ -135,7 +135,7 @@ class Drives:
 
     def fuse(self, outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
         """Yield outcomes, drive by drive, with the consensus as labels and scores."""
-        for outcome, scores, _ in self.consensus_of(outcomes):
+        for outcome, scores in self.consensus_of(outcomes):
             if isinstance(outcome, Labelled):
                 result = with_scores(outcome.result, scores, self.table)
                 outcome = replace(outcome, result=result)
@@ -207,7 +207,7 @@ def drive(
                 pose = as_pose(found, "poses") @ to_file(scan)
             yield DriveScan(result, scan.points[:, :3], result.scores, pose)
 
-    for result, scores, _ in Consensus(past_only=past_only).stream(segmented()):
+    for result, scores in Consensus(past_only=past_only).stream(segmented()):
         yield with_scores(result, scores)
 
 

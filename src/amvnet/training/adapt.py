@@ -31,9 +31,6 @@ from amvnet.weights.file import Weights, load, save
 
 TEACHER = "teacher"  # the folder of the labels that teach, in the folder of the run
 FIGURES = "figures.json"  # the figures of the scans under the weights that taught, in that folder
-# A point teaches if the probability of its consensus is larger, and enough scans saw its voxel.
-LEAST_PROBABILITY = 0.6
-LEAST_SIGHTS = 3
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,7 @@ class TaughtScans(Dataset):
         return replace(scan, labels=ids, name=record.name)
 
     def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
-        """Return the (N,) train ids that teach; 0 for points that teach nothing."""
+        """Return the (N,) train ids that teach; 0 for points without a label."""
         assert record.labels_path is not None
         ids: np.ndarray = np.load(record.labels_path, allow_pickle=False)
         return ids
@@ -132,15 +129,14 @@ def teach(
         folder: the folder for the labels, or None to write nothing.
 
     Raises:
-        InputError: if a scan cannot be read or segmented, or no point teaches.
+        InputError: if a scan cannot be read or segmented.
     """
     counts = np.zeros(4)  # of points, of uncertain ones, and of those that agree in two ways
-    taught = 0
     paths = label_paths(scans)
     fused = _fused(scans, drives, segmenter, progress)
-    for path, (result, probabilities, sights) in zip(paths, fused, strict=True):
+    for path, (result, probabilities) in zip(paths, fused, strict=True):
         is_valid = result.labels > 0
-        labels = np.where(probabilities.any(axis=1), probabilities.argmax(axis=1) + 1, 0)
+        labels = np.where(is_valid, probabilities.argmax(axis=1) + 1, 0).astype(np.uint8)
         assert result.rv is not None
         assert result.bev is not None
         agrees = result.rv.argmax(axis=1) == result.bev.argmax(axis=1)
@@ -150,24 +146,15 @@ def teach(
             counts[index] += np.count_nonzero(chosen)
 
         if folder is not None:
-            teaches = (probabilities.max(axis=1) > LEAST_PROBABILITY) & (sights >= LEAST_SIGHTS)
-            ids = np.where(teaches, labels, 0).astype(np.uint8)
-            taught += int(np.count_nonzero(ids))
             with atomic_write(inside(folder, path)) as part:
-                write_array(part, ids)
-    if folder is not None and not taught:
-        seen = "" if drives is None else f" in voxels that {LEAST_SIGHTS} scans see"
-        raise InputError(
-            f"expected points whose class has a probability over {LEAST_PROBABILITY}{seen}, found "
-            "none; give more scans of the drive, or --weights that know such a sensor"
-        )
+                write_array(part, labels)
     return Figures(*(float(share) for share in counts[1:] / max(counts[0], 1)))
 
 
 def _fused(
     scans: Sequence[ScanFile], drives: Drives | None, segmenter: Segmenter, progress: Progress
-) -> Iterator[tuple[Segmentation, np.ndarray, np.ndarray]]:
-    """Yield the result of each scan, and the probabilities (N, K) and sights (N,) of its points."""
+) -> Iterator[tuple[Segmentation, np.ndarray]]:
+    """Yield the result of each scan, and the probabilities (N, K) that its points get."""
 
     def segment(scan: ScanFile, loaded: Scan) -> Labelled:
         yaw = 0.0 if drives is None else drives.yaws[scan]
@@ -175,13 +162,12 @@ def _fused(
 
     outcomes = stream_scans(scans, lambda scan: scan.load(), segment, segmenter.at_once, progress)
     if drives is not None:
-        for outcome, probabilities, sights in drives.consensus_of(outcomes):
+        for outcome, probabilities in drives.consensus_of(outcomes):
             assert isinstance(outcome, Labelled)
-            yield outcome.result, probabilities, sights
+            yield outcome.result, probabilities
         return
     for outcome in outcomes:
-        result = outcome.result
-        yield result, result.probabilities, np.full(len(result), LEAST_SIGHTS)
+        yield outcome.result, outcome.result.probabilities
 
 
 def adapt(
