@@ -31,6 +31,7 @@ from amvnet.weights.file import Weights, load, save
 
 TEACHER = "teacher"  # the folder of the labels that teach, in the folder of the run
 FIGURES = "figures.json"  # the figures of the scans under the weights that taught, in that folder
+LEAST_PROBABILITY = 0.6  # a point teaches if its consensus has a larger one
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class TaughtScans(Dataset):
         return replace(scan, labels=ids, name=record.name)
 
     def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
-        """Return the (N,) train ids that teach; 0 for points without a label."""
+        """Return the (N,) train ids that teach; 0 for points that teach nothing."""
         assert record.labels_path is not None
         ids: np.ndarray = np.load(record.labels_path, allow_pickle=False)
         return ids
@@ -129,9 +130,10 @@ def teach(
         folder: the folder for the labels, or None to write nothing.
 
     Raises:
-        InputError: if a scan cannot be read or segmented.
+        InputError: if a scan cannot be read or segmented, or no point teaches.
     """
     counts = np.zeros(4)  # of points, of uncertain ones, and of those that agree in two ways
+    taught = 0
     paths = label_paths(scans)
     fused = _fused(scans, drives, segmenter, progress)
     for path, (result, probabilities) in zip(paths, fused, strict=True):
@@ -146,8 +148,15 @@ def teach(
             counts[index] += np.count_nonzero(chosen)
 
         if folder is not None:
+            ids = np.where(probabilities.max(axis=1) > LEAST_PROBABILITY, labels, 0)
+            taught += int(np.count_nonzero(ids))
             with atomic_write(inside(folder, path)) as part:
-                write_array(part, labels)
+                write_array(part, ids)
+    if folder is not None and not taught:
+        raise InputError(
+            f"expected points whose class has a probability over {LEAST_PROBABILITY}, found none; "
+            "give more scans of the drive, or --weights that know such a sensor"
+        )
     return Figures(*(float(share) for share in counts[1:] / max(counts[0], 1)))
 
 
