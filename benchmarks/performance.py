@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 import amvnet
 import amvnet.engines.base
+import amvnet.models.amvnet
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
@@ -112,6 +113,13 @@ def without_lead() -> None:
     LateFusion.fuse = fuse_all  # type: ignore[method-assign]
 
 
+def without_cubes() -> None:
+    """Let the head classify all disputed points in a cube of space, not only the first one."""
+    amvnet.models.amvnet.first_in_cubes = (  # type: ignore[attr-defined]
+        lambda points, index, edge: (index, torch.arange(len(index)))
+    )
+
+
 UNCHANGED = "unchanged"
 ALL = "all of these"
 REMOVALS: dict[str, Callable[[], None]] = {
@@ -123,6 +131,7 @@ REMOVALS: dict[str, Callable[[], None]] = {
     "neighbours by SciPy": without_pykdtree,
     "head's first layer once a neighbour": without_sharing,
     "head for all uncertain points": without_lead,
+    "head for all points of a cube": without_cubes,
 }
 
 

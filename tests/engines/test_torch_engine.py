@@ -89,6 +89,12 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
     merged = torch.sqrt(f * g)
     for i, rows in zip(index.split(PART), near.split(PART), strict=True):
         merged[i] = head(*head_features(head.config, table, i, rows)).softmax(dim=1)
+
+    if edge := head.config.cell:
+        first: dict[tuple[float, ...], int] = {}
+        cubes = np.floor(batch.points[index, :3].double().numpy() / edge)
+        for own, cube in zip(index.tolist(), cubes.tolist(), strict=True):
+            merged[own] = merged[first.setdefault(tuple(cube), own)]
     return expand_to_scan(merged.argmax(dim=1) + 1, scan.valid)
 
 
