@@ -128,7 +128,7 @@ def test_points_that_no_network_sees_count_as_evaluate_counts_them(
     segmenter = amvnet.load(weights)
     analyzed = analyze(dataset, records, segmenter)
     evaluation = analyzed.evaluation
-    expected = evaluate(dataset, records, label_by_weights(dataset, segmenter, tuple(METHODS)))
+    expected = evaluate(dataset, records, label_by_weights(segmenter, tuple(METHODS)))
     assert set(expected.matrices) - set(evaluation.matrices) == {"rv-knn"}
     for method, matrices in evaluation.matrices.items():
         np.testing.assert_array_equal(matrices, expected.matrices[method])

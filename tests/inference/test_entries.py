@@ -268,7 +268,7 @@ def by_evaluate_of_a_dataset(world: World, points: np.ndarray) -> np.ndarray:
 
 
 def _evaluated(world: World, dataset: Any) -> np.ndarray:
-    labeller = label_by_weights(dataset, world.segmenter)
+    labeller = label_by_weights(world.segmenter)
     (record,) = dataset.records(dataset.sequences("all"))
     labels, *_ = labeller.label(record, dataset.read(record))
     return labels["amvnet"]
@@ -383,7 +383,7 @@ def test_what_is_official_of_nuscenes_labels_the_own_car(tmp_path: Path, keep_ow
 
     dataset = open_dataset(layout.spec)
     record, _ = dataset.records([layout.sequences[0]])
-    assert label_by_weights(dataset, segmenter).label(record, dataset.read(record)).ids["rv"].all()
+    assert label_by_weights(segmenter).label(record, dataset.read(record)).ids["rv"].all()
     (result,) = [each for each in segmenter.each(layout.spec) if len(each) == len(points)]
     np.testing.assert_array_equal(result.labels == 0, own & ~keep_own)
 

@@ -112,7 +112,7 @@ def test_torch_has_its_threads_back_after_the_stream() -> None:
 
 def _evaluated(dataset: Dataset, segmenter: Segmenter) -> Any:
     records = dataset.records(["08"])
-    return evaluate(dataset, records, label_by_weights(dataset, segmenter)).report("x")
+    return evaluate(dataset, records, label_by_weights(segmenter)).report("x")
 
 
 def _analyzed(dataset: Dataset, segmenter: Segmenter) -> Any:

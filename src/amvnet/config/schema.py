@@ -265,6 +265,7 @@ class Part:
     Attributes:
         name: its name in `AMVNet` and in weights.
         sizes: the fields of `ModelConfig` that set its sizes.
+        title: its name in words.
         short: its name in tables and figures.
     """
 

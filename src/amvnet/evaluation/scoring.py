@@ -196,7 +196,6 @@ def stream_labelled(
 
 
 def label_by_weights(
-    dataset: Dataset,
     segmenter: Segmenter,
     methods: Sequence[str] = PAPER_METHODS,
     classes: ClassMap | None = None,

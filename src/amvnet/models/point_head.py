@@ -19,7 +19,9 @@ from amvnet.runtime.threads import run_parts
 POINT_VALUES = 4  # number of a point's own values: x, y, z, intensity
 MIN_PRODUCT = 1e-24  # lower bound of f * g, so that its logarithm is finite
 CUBES = 2**21 - 1  # largest number of a cube along an axis
-PART_ON_CPU = ROWS  # number of uncertain points encoded at a time on a CPU, which fit its cache
+# Number of uncertain points encoded at a time on a CPU: they fit its cache, and the rows of their
+# neighbours need no padding.
+PART_ON_CPU = ROWS
 PART_ON_GPU = 2**16  # number of uncertain points encoded at a time on a GPU, which keep it busy
 POINTS_AT_ONCE = 2**17  # number of uncertain points classified at a time, which limits the memory
 

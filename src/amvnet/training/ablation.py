@@ -50,7 +50,7 @@ def sweep_heads(
         head_plan = dataclasses.replace(plan, recipe=recipe, out=out, init=networks)
 
         segmenter = load(train(head_plan), device)
-        evaluation = evaluate(dataset, plan.data.val, label_by_weights(dataset, segmenter))
+        evaluation = evaluate(dataset, plan.data.val, label_by_weights(segmenter))
         uncertain = evaluation.uncertain / max(evaluation.asked, 1)
         yield swept_row(value, uncertain, evaluation.matrices["amvnet"][0], dataset.taxonomy)
 
@@ -103,7 +103,7 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
 
         segmenter = load(path, plan.processes.device(choose_device(device)), "rv")
         dataset = plan.data.sources[0].dataset
-        labeller = label_by_weights(dataset, segmenter)
+        labeller = label_by_weights(segmenter)
         evaluation = evaluate(dataset, plan.data.val, labeller, processes=plan.processes)
         yield gru, weighted, metrics(evaluation.matrices["rv"][0], dataset.taxonomy)
 

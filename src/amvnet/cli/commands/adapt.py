@@ -136,7 +136,7 @@ def _score_on(
     records = LabelledChoice("all", sequences).records(dataset)
 
     def score(segmenter: Segmenter) -> float:
-        labeller = label_by_weights(dataset, segmenter, ["amvnet"])
+        labeller = label_by_weights(segmenter, ["amvnet"])
         with progress("scoring") as step:
             evaluation = evaluate(dataset, records, labeller, progress=step)
         miou: float = evaluation.report(val)["methods"]["amvnet"]["miou"]

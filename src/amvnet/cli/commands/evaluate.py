@@ -97,7 +97,7 @@ def evaluate(
         device = processes.device(choose_device(compute.device, compute.engine))
         compute = replace(compute, device=device)
         segmenter = load_segmenter(loaded, widest_method(parts), compute, tau)
-        labeller = label_by_weights(dataset, segmenter, methods, mapping)
+        labeller = label_by_weights(segmenter, methods, mapping)
     else:
         for flag, is_given in (("--tau", tau is not None), ("--drive", drive_choice.drive)):
             if is_given:
