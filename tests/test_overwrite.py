@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from amvnet.files import Signature, check_outputs
 from amvnet.inference.journal import JOURNAL, UNFINISHED
 from amvnet.onnx_runner import DESCRIPTION
-from amvnet.outputs import Signature, check_outputs
 
 from fixtures.commands import contents, fails, files, refusal, refused, run_cli, succeed
 from fixtures.marks import with_full

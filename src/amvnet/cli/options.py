@@ -12,8 +12,8 @@ from amvnet.cli.parser import flag_of
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
 from amvnet.errors import InputError, listed
+from amvnet.files import FormatName
 from amvnet.models.methods import MethodName, widest_method
-from amvnet.outputs import FormatName
 from amvnet.progress import counted
 from amvnet.sensors.lidars import AUTO, UNKNOWN_SENSOR, Sensor
 

@@ -26,8 +26,7 @@ from amvnet.drives.consensus import (
     weighted_logs,
 )
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
-from amvnet.outputs import Signature
+from amvnet.files import Signature, atomic_write
 
 MOVABLE = ("vehicle", "two-wheeler", "person")  # coarse classes whose points may move
 

@@ -13,9 +13,8 @@ import numpy as np
 from amvnet.evaluation.analysis import BINS, Analysis, SweptRow
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.top_view import PICTURE
-from amvnet.files import atomic_write
+from amvnet.files import Signature, atomic_write
 from amvnet.models.methods import title_of
-from amvnet.outputs import Signature
 
 SIZE = (6.0, 3.6)  # width and height of a figure, inches
 DOTS_PER_INCH = 160

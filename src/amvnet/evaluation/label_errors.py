@@ -21,11 +21,10 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy, check_classes
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
+from amvnet.files import Signature, atomic_write
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
-from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.outputs import Signature
+from amvnet.files import Signature
 
 REPORT = Signature("figures of evaluate", rb'\{\s*"dataset": ')
 # Edges of the bins in SemanticKITTI's evaluation by distance, metres.

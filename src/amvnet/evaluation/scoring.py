@@ -20,7 +20,7 @@ from amvnet.drives.consensus import DriveScan
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import PICTURE, TopView, draw_scan
-from amvnet.files import inside
+from amvnet.files import Signature, inside
 from amvnet.inference.drive import Drives
 from amvnet.inference.journal import read_journals
 from amvnet.inference.scan_stream import stream_scans
@@ -28,7 +28,6 @@ from amvnet.inference.segmentation import expand_labels, expand_to_scan, scores_
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS, PAPER_METHODS
 from amvnet.models.voting import vote
-from amvnet.outputs import Signature
 from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan, check_scan

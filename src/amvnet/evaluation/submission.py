@@ -23,8 +23,7 @@ from amvnet.data.labels.ids import check_size, train_ids
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, listed
-from amvnet.files import atomic_write
-from amvnet.outputs import Signature
+from amvnet.files import Signature, atomic_write
 from amvnet.progress import Progress, no_progress
 
 # The number of test scans of SemanticKITTI (KITTI odometry 11 to 21). The server expects all of

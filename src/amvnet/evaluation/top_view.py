@@ -13,8 +13,7 @@ import numpy as np
 
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Color, Taxonomy
-from amvnet.files import atomic_write
-from amvnet.outputs import Signature
+from amvnet.files import Signature, atomic_write
 
 REACH = 50.0  # distance that is shown on each side of the sensor, metres
 PANEL = 4.6  # width and height of a panel, inches

@@ -26,12 +26,20 @@ from amvnet.data.labels.writers import (
 from amvnet.data.recordings import ScanFile, by_recording
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken, memory_for
-from amvnet.files import alone_in, atomic_write, digest, inside, size_and_time
+from amvnet.files import (
+    Signature,
+    alone_in,
+    atomic_write,
+    check_not_read,
+    check_outputs,
+    digest,
+    inside,
+    size_and_time,
+)
 from amvnet.inference.drive import Broken, Drives, Labelled, Outcome
 from amvnet.inference.journal import UNFINISHED, Entry, Journal, check_unchanged, read_journals
 from amvnet.inference.scan_stream import READ_AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
-from amvnet.outputs import Signature, check_not_read, check_outputs
 from amvnet.progress import Progress, counted, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED_SCANS

@@ -15,9 +15,9 @@ from amvnet.data.labels.writers import KINDS, SIGNATURES, write_scan_labels
 from amvnet.data.palette import class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, did_you_mean
+from amvnet.files import check_outputs
 from amvnet.models.amvnet import Scores
 from amvnet.models.methods import METHODS
-from amvnet.outputs import check_outputs
 from amvnet.scan import Scan
 from amvnet.weights.verdict import Verdict
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from amvnet.files import Signature
 from amvnet.inference.segmentation import label_ids
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import AMVNet, Watch, one_after_the_other
 from amvnet.models.methods import geometric_mean
-from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.runtime.memory import peak_memory
 from amvnet.scan import Scan

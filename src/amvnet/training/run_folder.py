@@ -15,8 +15,7 @@ from amvnet.config.schema import PART_OF, Recipe, StageName
 from amvnet.config.yaml_files import read_entries
 from amvnet.data.datasets.open import is_dataset
 from amvnet.errors import InputError, listed
-from amvnet.files import alone_in, atomic_write, remove_unfinished, write_yaml
-from amvnet.outputs import check_not_read
+from amvnet.files import alone_in, atomic_write, check_not_read, remove_unfinished, write_yaml
 from amvnet.weights.file import DONE, RECORD, RUN_WEIGHTS, SETTINGS, Weights, read, save
 from amvnet.weights.parts import replace_part
 

@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.evaluation.metrics import OVERALL, Evaluation
-from amvnet.files import atomic_write, unfinished
+from amvnet.files import Signature, atomic_write, check_outputs, unfinished
 from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
-from amvnet.outputs import Signature, check_outputs
 from amvnet.scan import AnyArray, Scan
 from amvnet.sensors.reading import checked_scan
 from amvnet.viewing.shown_scans import CORRECT, UNSCORED, ShownScan, short_name, shown_scan

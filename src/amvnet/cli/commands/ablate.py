@@ -26,7 +26,7 @@ def ablate(
             is cuda if there is a GPU.
     """
     from amvnet.evaluation import charts
-    from amvnet.outputs import check_outputs
+    from amvnet.files import check_outputs
     from amvnet.runtime.distributed import device_of
     from amvnet.training.ablation import ablate as ablate_recipe
     from amvnet.training.ablation import is_begun

@@ -53,8 +53,7 @@ def analyze(
     from amvnet.data.datasets.training_data import Source, TrainingData
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
-    from amvnet.files import make_folder
-    from amvnet.outputs import check_outputs
+    from amvnet.files import check_outputs, make_folder
     from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
     from amvnet.training.plan import Plan
 

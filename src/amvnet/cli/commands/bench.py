@@ -38,10 +38,9 @@ def bench(
     from amvnet.data.datasets.simulated import simulate
     from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
-    from amvnet.files import temporary_folder, write_json
+    from amvnet.files import check_outputs, temporary_folder, write_json
     from amvnet.inference.listing import find_inputs
     from amvnet.inference.timing import FIGURES, time_runs
-    from amvnet.outputs import check_outputs
 
     if json is not None:
         check_outputs({json: FIGURES}, [weights, scan], overwrite)

@@ -38,9 +38,9 @@ def demo(
     from amvnet.data.taxonomy import CLASSES_BY_SENSOR, SEMANTICKITTI
     from amvnet.errors import InputError
     from amvnet.evaluation.metrics import REPORT
+    from amvnet.files import check_outputs
     from amvnet.inference.listing import find_inputs
     from amvnet.inference.loading import load
-    from amvnet.outputs import check_outputs
     from amvnet.sensors.built_in import lasers_of, weights_for
     from amvnet.viewing.page import PAGE, write_page
     from amvnet.viewing.shown_scans import show_scans

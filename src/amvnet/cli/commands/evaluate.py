@@ -71,8 +71,7 @@ def evaluate(
     from amvnet.evaluation.metrics import REPORT
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files, pictures_of
-    from amvnet.files import make_folder
-    from amvnet.outputs import check_outputs
+    from amvnet.files import check_outputs, make_folder
 
     def check_files(records: Sequence[ScanFile]) -> None:
         """Check that all files can be written, before time is spent on networks and scans."""

@@ -19,8 +19,8 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
     """
     from amvnet.engines.export.onnx import check_libraries, possible_files
     from amvnet.engines.export.onnx import export as export_weights
+    from amvnet.files import check_outputs
     from amvnet.inference.calibration import calibration_scans
-    from amvnet.outputs import check_outputs
     from amvnet.weights.file import load
 
     check_outputs(possible_files(out), [weights, int8], overwrite)

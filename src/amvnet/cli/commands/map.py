@@ -52,9 +52,8 @@ def map(
     """
     from amvnet.drives.world_map import FIGURES, SIGNATURES, MapBuilder, check_ending
     from amvnet.engines.precision import resolved
-    from amvnet.files import alone_in, digest, write_json
+    from amvnet.files import alone_in, check_outputs, digest, write_json
     from amvnet.inference.drive import SavedMap, find_poses, map_drive
-    from amvnet.outputs import check_outputs
 
     check_ending(out)
     if json is not None and json.resolve() == out.resolve():

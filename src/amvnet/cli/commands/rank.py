@@ -33,8 +33,7 @@ def rank(
     """
     from amvnet.evaluation.label_errors import TABLE, write_clusters
     from amvnet.evaluation.label_errors import rank as rank_records
-    from amvnet.files import make_folder
-    from amvnet.outputs import check_outputs
+    from amvnet.files import check_outputs, make_folder
 
     # Check the output before any scan is scored, so that no time is wasted.
     check_outputs({out: TABLE}, [data, weights], overwrite)

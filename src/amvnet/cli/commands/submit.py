@@ -34,7 +34,7 @@ def submit(
     """
     from amvnet.data.datasets.open import open_dataset
     from amvnet.evaluation.submission import ARCHIVE, rules_for, write_archive
-    from amvnet.outputs import check_outputs
+    from amvnet.files import check_outputs
 
     rules = rules_for(open_dataset(data), split, sequences)
     if use_external and rules.meta is None:

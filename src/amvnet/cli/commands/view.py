@@ -49,8 +49,7 @@ def view(
     """
     from amvnet.data.recordings import evenly_spaced
     from amvnet.data.taxonomy import TAXONOMIES
-    from amvnet.files import make_folder
-    from amvnet.outputs import check_outputs
+    from amvnet.files import check_outputs, make_folder
     from amvnet.sensors.normalise import Normaliser
     from amvnet.viewing.page import PAGE, open_page, page_name, place_for_page, write_page
     from amvnet.viewing.shown_scans import check_labels, show_scans

@@ -14,8 +14,7 @@ from amvnet.data.labels.clouds import PCD_HEADER, Columns, write_cloud
 from amvnet.data.labels.ids import check_count, write_array, write_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
-from amvnet.outputs import FormatName, Signature
+from amvnet.files import FormatName, Signature, atomic_write
 
 KINDS = get_args(FormatName)
 

@@ -18,14 +18,13 @@ from amvnet.engines.base import build_model
 from amvnet.engines.export.int8 import KEEPS_FIRST_LAYER, quantise
 from amvnet.engines.export.onnx_files import digest, finish, quiet
 from amvnet.errors import InputError, import_optional
-from amvnet.files import atomic_write, publish, temporary_folder, write_json
+from amvnet.files import Signature, atomic_write, publish, temporary_folder, write_json
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import MethodName, check_method, widest_method
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS_BY_METHOD
-from amvnet.outputs import Signature
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
 from amvnet.weights.file import Weights, load
