@@ -5,7 +5,7 @@
 By default, the recipes are `semantickitti` and `nuscenes`. The networks run once on a simulated
 scan of their sensor, and torch counts the operations: GMAC are billions of multiply-adds. The
 second number is what is computed here, because a convolution of an upsampled map is computed on the
-coarse map (`models/upsampled_conv.py`).
+coarse map (`apply_to_joined` of `models/layers.py`).
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from amvnet.engines import torch as torch_engine
 from amvnet.engines.graphs import MAX_SHAPES, WARM_UP_RUNS, Captured, GraphCheck
 from amvnet.engines.precision import InPrecision
 from amvnet.engines.torch import TorchEngine
-from amvnet.models import upsampled_conv
+from amvnet.models import layers
 from amvnet.models.amvnet import Scores, one_after_the_other
 from amvnet.models.layers import freeze
 from amvnet.models.polar_net import PolarNet
@@ -128,14 +128,14 @@ def test_kernels_that_depend_on_the_weights_alone_are_made_once(
     with_gradients = net(x)  # makes them each time
 
     made = 0
-    taps = upsampled_conv._taps
+    taps = layers._taps
 
     def counted(scale: int, like: Tensor) -> Tensor:
         nonlocal made
         made += 1
         return taps(scale, like)
 
-    monkeypatch.setattr(upsampled_conv, "_taps", counted)
+    monkeypatch.setattr(layers, "_taps", counted)
     with torch.inference_mode():
         first = net(x)
         made_first = made

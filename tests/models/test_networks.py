@@ -21,13 +21,14 @@ from amvnet.models.layers import (
     AzimuthGRU,
     PointLinear,
     RingConv2d,
+    _kernels,
+    convolve_joined,
     freeze,
     upsample,
     wrap_width,
 )
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
-from amvnet.models.upsampled_conv import _kernels, convolve_joined
 from amvnet.weights.file import load
 
 from fixtures.networks import CASES, Case

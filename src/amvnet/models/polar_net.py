@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from amvnet.config.schema import PolarNetConfig
-from amvnet.models.layers import ConvBlock, PointLinear, linear
-from amvnet.models.upsampled_conv import apply_to_joined
+from amvnet.models.layers import ConvBlock, PointLinear, apply_to_joined, linear
 from amvnet.models.views.polar_view import FEATURES, PolarGrid
 
 PART_ON_CPU = 8192  # number of points encoded at a time on a CPU, which fit its cache

@@ -8,8 +8,14 @@ from torch.nn import functional as F
 
 from amvnet.config.schema import RangeNetConfig
 from amvnet.models.cpu_convolution import convolve
-from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample, wrap_width
-from amvnet.models.upsampled_conv import apply_to_joined
+from amvnet.models.layers import (
+    AzimuthGRU,
+    ConvBlock,
+    ResidualBlock,
+    apply_to_joined,
+    upsample,
+    wrap_width,
+)
 from amvnet.models.views.range_view import CHANNELS
 
 FIRST_DECODED_STAGE = 1  # index of the first stage that the decoder uses; its width stride is 4

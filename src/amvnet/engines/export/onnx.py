@@ -323,7 +323,7 @@ def _convert(graph: Graph, name: str, path: Path) -> None:
             verbose=False,
         )
         assert program is not None
-        # Compute weights that are sums of other weights (`models.upsampled_conv`) only once, in
+        # Compute weights that are sums of other weights (`convolve_joined`) only once, in
         # spite of their size: by default, only small tensors count as constants.
         optimize(program.model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
         program.save(path, external_data=False)
