@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-from amvnet.engines import precision
+from amvnet.cli.commands import evaluate
+from amvnet.engines import compute
 from amvnet.engines.export import onnx as onnx_export
 from amvnet.scan import Scan
 
@@ -42,13 +43,14 @@ def _random_scan(count: int, seed: int = 0) -> Scan:
 @pytest.fixture(scope="session", autouse=True)
 def on_cpu() -> Iterator[None]:
     """Let `auto` be the CPU even if there is a GPU, because a GPU rounds sums differently."""
-    choose = precision.choose_device
+    choose = compute.choose_device
 
     def choose_cpu(name: str, engine: str = "torch") -> str:
         return choose("cpu" if name == "auto" else name, engine)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(precision, "choose_device", choose_cpu)
+        for module in (compute, evaluate):
+            patch.setattr(module, "choose_device", choose_cpu)
         yield
 
 

@@ -21,9 +21,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import amvnet
 from amvnet import Scan, Segmenter, load, simulate
 from amvnet import read as read_scan
-from amvnet.engines.compute import Precision
-from amvnet.engines.precision import InPrecision, choose_device, choose_precision
-from amvnet.engines.streams import TwoStreams
+from amvnet.engines.compute import Precision, choose_device, choose_precision
+from amvnet.engines.torch import InPrecision, TwoStreams
 from amvnet.inference.journal import Entry, Journal
 from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by

@@ -18,9 +18,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from amvnet.engines import torch as torch_engine
-from amvnet.engines.graphs import MAX_SHAPES, WARM_UP_RUNS, Captured, GraphCheck
-from amvnet.engines.precision import InPrecision
-from amvnet.engines.torch import TorchEngine
+from amvnet.engines.torch import (
+    MAX_SHAPES,
+    WARM_UP_RUNS,
+    Captured,
+    GraphCheck,
+    InPrecision,
+    TorchEngine,
+)
 from amvnet.models import layers
 from amvnet.models.amvnet import Scores, one_after_the_other
 from amvnet.models.layers import freeze

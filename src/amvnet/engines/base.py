@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.engines.compute import Precision
-from amvnet.models.amvnet import AMVNet, Scores
+from amvnet.models.amvnet import AMVNet, Score, Scores
 from amvnet.models.assertion import Disagreement
 from amvnet.models.layers import freeze
 from amvnet.models.methods import METHODS, MethodName, check_method
@@ -17,7 +17,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid
 from amvnet.models.voting import vote
 from amvnet.runtime.memory import available_memory
-from amvnet.runtime.threads import survive_forks
+from amvnet.runtime.threads import run_parts, survive_forks
 from amvnet.weights.file import Weights
 
 # The memory budget per scan, bytes. A scan of 120,000 points takes half of it in networks of the
@@ -124,6 +124,12 @@ def build_model(
         model.ensemble = ensemble
         model.point_head = None
     return model
+
+
+def side_by_side(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
+    """Run both networks at the same time if threads of the CPU are idle, else in turn."""
+    f, g = run_parts(lambda score: score(), (score_range, score_polar))
+    return f, g
 
 
 def _none_uncertain(scores: Tensor) -> Tensor:

@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from amvnet.engines.base import Engine, WithUnet, build_model
-from amvnet.engines.streams import side_by_side
+from amvnet.engines.base import Engine, WithUnet, build_model, side_by_side
 from amvnet.errors import InputError
 from amvnet.models.methods import METHODS, MethodName
 from amvnet.models.polar_net import PolarNet

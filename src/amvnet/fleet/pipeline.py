@@ -20,8 +20,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from amvnet.engines.compute import Compute
-from amvnet.engines.precision import choose_precision
+from amvnet.engines.compute import Compute, choose_precision
 from amvnet.errors import InputError, reason_of
 from amvnet.fleet.labelling import DEFAULTS, IS_FATAL, LabelScans, MeasureSensors
 from amvnet.fleet.labelling import choose_weights as choose_for_drive

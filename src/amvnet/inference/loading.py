@@ -12,10 +12,9 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.rows import parse_layout
 from amvnet.data.recordings import Recording, ScanFile
 from amvnet.engines.base import Engine
-from amvnet.engines.compute import Compute, EngineName, Precision
+from amvnet.engines.compute import Compute, EngineName, Precision, resolved
 from amvnet.engines.export.cache import cached_networks
 from amvnet.engines.onnx import OnnxEngine
-from amvnet.engines.precision import resolved
 from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.inference.listing import Inputs

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from amvnet.config.schema import BOTH_NETWORKS, ModelConfig, Recipe
-from amvnet.engines.precision import choose_device
+from amvnet.engines.compute import choose_device
 from amvnet.evaluation.analysis import SweptRow, swept_row
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights

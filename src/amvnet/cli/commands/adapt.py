@@ -16,7 +16,7 @@ from amvnet.cli.options import (
     open_inputs,
 )
 from amvnet.config.bounds import Count, Seed, Share
-from amvnet.engines.compute import Compute
+from amvnet.engines.compute import Compute, resolved
 from amvnet.errors import InputError
 from amvnet.sensors.lidars import AUTO
 
@@ -70,7 +70,6 @@ def adapt(
     from amvnet.data.datasets.base import choose_records
     from amvnet.data.datasets.simulated import SimulatedStreets
     from amvnet.data.datasets.training_data import Source, TrainingData, to_mix_in
-    from amvnet.engines.precision import resolved
     from amvnet.inference.drive import find_poses
     from amvnet.models.methods import check_method
     from amvnet.training.adapt import adapt as adapt_weights

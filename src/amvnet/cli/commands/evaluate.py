@@ -17,7 +17,7 @@ from amvnet.cli.options import (
     map_to,
 )
 from amvnet.config.bounds import Share
-from amvnet.engines.compute import Compute
+from amvnet.engines.compute import Compute, choose_device
 from amvnet.errors import InputError
 from amvnet.models.methods import PAPER_METHODS, MethodName, check_method, methods_of, widest_method
 from amvnet.sensors.lidars import AUTO
@@ -67,7 +67,6 @@ def evaluate(
         overwrite: replace figures and drawings that exist.
     """
     from amvnet.data.datasets.open import open_dataset
-    from amvnet.engines.precision import choose_device
     from amvnet.evaluation.metrics import REPORT
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files, pictures_of

@@ -8,7 +8,7 @@ from typing import Annotated
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_segmenter, open_inputs
 from amvnet.config.bounds import Range
-from amvnet.engines.compute import Compute
+from amvnet.engines.compute import Compute, resolved
 from amvnet.errors import InputError
 from amvnet.progress import counted
 from amvnet.sensors.lidars import AUTO
@@ -51,7 +51,6 @@ def map(
         overwrite: replace files that exist.
     """
     from amvnet.drives.world_map import FIGURES, SIGNATURES, MapBuilder, check_ending
-    from amvnet.engines.precision import resolved
     from amvnet.files import alone_in, check_outputs, digest, write_json
     from amvnet.inference.drive import SavedMap, find_poses, map_drive
 

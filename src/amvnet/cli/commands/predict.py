@@ -17,7 +17,7 @@ from amvnet.cli.options import (
     open_inputs,
 )
 from amvnet.config.bounds import Count
-from amvnet.engines.compute import Compute
+from amvnet.engines.compute import Compute, resolved
 from amvnet.errors import InputError
 from amvnet.progress import counted
 from amvnet.sensors.lidars import AUTO
@@ -60,7 +60,6 @@ def predict(
         overwrite: replace files that exist.
     """
     from amvnet.cli.tables import labelled_table
-    from amvnet.engines.precision import resolved
     from amvnet.inference.journal import JOURNAL
     from amvnet.inference.pipeline import check_faults
     from amvnet.inference.predict import predict as predict_inputs
