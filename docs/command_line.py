@@ -9,7 +9,7 @@ from contextlib import redirect_stdout, suppress
 from typing import Any
 
 from amvnet.cli.main import main
-from amvnet.cli.recipe_options import HELP_ALL
+from amvnet.cli.parser import HELP_ALL
 
 PAGE = "command_line.md"
 PLACE = "<!-- the help of every command -->"

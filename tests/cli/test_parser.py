@@ -10,8 +10,7 @@ import pytest
 
 from amvnet.cli.main import COMMANDS, main
 from amvnet.cli.options import ScanChoice
-from amvnet.cli.parser import field_texts, make_parser, run_with
-from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
+from amvnet.cli.parser import HELP_ALL, add_recipe, field_texts, make_parser, run_with, with_options
 from amvnet.config.schema import ModelConfig, Recipe
 
 from fixtures.commands import refusal, refused, run_cli

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from amvnet.cli.main import COMMANDS, WITH_RECIPE
-from amvnet.cli.parser import Parser, make_parser
-from amvnet.cli.recipe_options import HELP_ALL, add_recipe
+from amvnet.cli.parser import HELP_ALL, Parser, add_recipe, make_parser
 from amvnet.config.schema import Recipe
 
 from fixtures.pages import DocsPage

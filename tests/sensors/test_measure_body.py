@@ -14,8 +14,7 @@ from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
 from amvnet.sensors.lidars import KNOWN_BODIES, Sensor, make_sensor
-from amvnet.sensors.measure_body import Body, find_body, measure_body
-from amvnet.sensors.own_body import is_inside
+from amvnet.sensors.own_body import Body, find_body, is_inside, measure_body
 
 from fixtures.commands import succeed
 

@@ -29,8 +29,10 @@ from amvnet.cli.commands.submit import submit
 from amvnet.cli.commands.train import train
 from amvnet.cli.commands.view import view
 from amvnet.cli.console import report, report_fault, report_lines, stdout
-from amvnet.cli.parser import first_line, make_parser, run_with
+from amvnet.cli.parser import HELP_ALL, add_recipe, first_line, make_parser, run_with, with_options
 from amvnet.cli.stopping import stoppable
+from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import Recipe
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
@@ -158,10 +160,6 @@ def run(command: str, arguments: Sequence[str]) -> None:
 
 def _parse_with_recipe(command: str, arguments: Sequence[str]) -> dict[str, Any]:
     """Parse the arguments of a command with a recipe, whose values its options replace."""
-    from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
-    from amvnet.config.recipes import load_recipe
-    from amvnet.config.schema import Recipe
-
     # The help shows the values of the recipe that is named, or else the values of the paper.
     asks_for_help = bool({"-h", "--help", HELP_ALL} & set(arguments))
     names_recipe = bool(arguments) and not arguments[0].startswith("-")

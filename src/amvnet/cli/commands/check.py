@@ -32,8 +32,8 @@ def check(data: str, /, choice: TrainingChoice) -> None:
     """
     from amvnet.data.datasets.open import open_dataset, undescribed
     from amvnet.data.datasets.starter import write_starter
-    from amvnet.sensors.measure_body import measure_body
     from amvnet.sensors.normalise import described_sensor
+    from amvnet.sensors.own_body import measure_body
 
     folder = undescribed(data)
     if folder is not None:

@@ -18,7 +18,7 @@ from amvnet.data.datasets.description import ENDINGS, REST, LabelPlace
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import scan_stem
 from amvnet.data.formats.find import list_scans
-from amvnet.data.labels.legend import read_legend
+from amvnet.data.labels.clouds import read_legend
 from amvnet.data.labels.readers import COLUMNS, read_raw_labels
 from amvnet.data.recordings import evenly_spaced
 from amvnet.data.taxonomy import INSTANCE_MASK

@@ -1,17 +1,24 @@
-"""Write labelled points as PLY, PCD, LAS or LAZ."""
+"""Write labelled points as PLY, PCD, LAS or LAZ, and read the classes that such a file names.
+
+Each class is a line of JSON, such as `amvnet class {"id": 10, "name": "car", "color": [...]}`: a
+comment of PLY and PCD, and a record of LAS.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
 from amvnet.data.formats import las, pcd, ply
-from amvnet.data.labels.legend import legend_of
+from amvnet.data.formats.registry import read_comments
 from amvnet.data.palette import class_colors
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
+from amvnet.errors import InputError
 
 Columns = dict[str, np.ndarray]
 
@@ -29,6 +36,9 @@ LOCAL_COORDINATES = (
 FULL_COLOR = 257  # colours of LAS have 16 bits: 255 * 257 = 65535
 MILLIMETRE = 0.001
 FARTHEST = 1_000_000.0  # largest coordinate, metres, from which 32 bits of millimetres reach 0
+CLASSES = "amvnet classes "  # begins the line with the name of the classes
+CLASS = "amvnet class "  # begins the line of a class; the first one is of points without a class
+LONGEST_LEGEND = 60_000  # the longest legend that a header holds, bytes
 
 
 def write_cloud(
@@ -142,3 +152,52 @@ def _write_las(
     content = BytesIO()  # lazrs hides the system's reason if it cannot write a file
     cloud.write(content, do_compress=packed, laz_backend=laspy.LazBackend.Lazrs)
     path.write_bytes(content.getbuffer())
+
+
+def legend_of(taxonomy: Taxonomy) -> list[str]:
+    """Return the lines of ASCII that name the classes, or none if they are too long."""
+    lines = [CLASSES + json.dumps(taxonomy.name)]
+    entries = zip(taxonomy.train_to_raw, taxonomy.names, taxonomy.colors, strict=True)
+    for raw, name, color in entries:
+        lines.append(CLASS + json.dumps({"id": raw, "name": name, "color": color}))
+    return lines if sum(map(len, lines)) <= LONGEST_LEGEND else []
+
+
+def read_legend(path: Path) -> Taxonomy | None:
+    """Return the classes that a file of labelled points names; None if it names none.
+
+    A broken file names none: whoever reads its points gets the error.
+    """
+    with suppress(InputError):
+        return _classes_of(read_comments(path))
+    return None
+
+
+def _classes_of(comments: Iterable[str]) -> Taxonomy | None:
+    name = ""
+    entries = []
+    with suppress(ValueError, KeyError, TypeError, RecursionError):  # comments of a stranger
+        for comment in comments:
+            if comment.startswith(CLASSES):
+                name = json.loads(comment.removeprefix(CLASSES))
+            elif comment.startswith(CLASS):
+                values = json.loads(comment.removeprefix(CLASS))
+                entries.append((values["id"], values["name"], values["color"]))
+    if not entries:
+        return None
+
+    raw_ids, names, colors = zip(*entries, strict=True)
+    known = TAXONOMIES.get(str(name))
+    if known is not None and (known.names, known.train_to_raw) == (names, raw_ids):
+        return known
+    return Taxonomy.from_dict(
+        {
+            "name": name,
+            "classes": names[1:],
+            "colors": colors,
+            "raw_to_train": [(raw, ids) for ids, raw in enumerate(raw_ids)],
+            "train_to_raw": raw_ids,
+            "splits": {},
+            "counts_absent": False,
+        }
+    )

@@ -74,7 +74,7 @@ def write_scan_labels(
     - `pcd` (binary): the same, with the colours packed in rgb.
     - `las`, `laz`: the same, as `write_cloud` describes it.
 
-    Files of points also name the classes, as `legend` describes it.
+    Files of points also name the classes, as `legend_of` returns them.
 
     Args:
         stem: the path without an ending; `.` and the kind are added.
