@@ -21,7 +21,7 @@ from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.datasets.training_data import Source, TrainingData, to_train
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.sensors.expectation import Expectation
-from amvnet.sensors.laser_order import lasers_by_order
+from amvnet.sensors.lasers import lasers_by_order
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, drive_street, simulate, writing

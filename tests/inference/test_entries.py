@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import amvnet
 from amvnet import onnx_runner
+from amvnet.cli.commands.export import calibration_scans
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.check import check_scans
 from amvnet.data.datasets.open import open_dataset
@@ -27,7 +28,6 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.engines.export.onnx import describe_export, export
 from amvnet.errors import InputError
 from amvnet.evaluation.scoring import label_by_weights
-from amvnet.inference.calibration import calibration_scans
 from amvnet.inference.fuse import Fusion
 from amvnet.inference.listing import find_inputs
 from amvnet.inference.request import LabellingRequest
@@ -39,7 +39,7 @@ from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan, turned
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
-from amvnet.sensors.laser_order import lasers_by_order
+from amvnet.sensors.lasers import lasers_by_order
 from amvnet.sensors.lidars import Sensor, rotation_from_degrees
 from amvnet.sensors.normalise import Normaliser, normalised
 from amvnet.training.loaders import ScanSet, collate

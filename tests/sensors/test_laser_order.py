@@ -11,7 +11,7 @@ import pytest
 from amvnet.config.schema import RangeViewConfig
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
-from amvnet.sensors.laser_order import lasers_by_order, order_rings
+from amvnet.sensors.lasers import lasers_by_order, order_rings
 from amvnet.sensors.lidars import rotation_from_degrees
 
 LASERS = 16

@@ -35,11 +35,11 @@ from amvnet.models.neighbours import nearest_others
 from amvnet.models.views import polar_view
 from amvnet.onnx_runner import distances, image_rows, polar_features, range_image, scores_of_points
 from amvnet.scan import Scan
-from amvnet.sensors import built_in, frame, ground, intensity, laser_order, lasers, own_body
+from amvnet.sensors import built_in, frame, ground, intensity, lasers, own_body
 from amvnet.sensors import rows as sensor_rows
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
-from amvnet.sensors.laser_order import lasers_by_order
+from amvnet.sensors.lasers import lasers_by_order
 from amvnet.sensors.lidars import ANY, rotation_from_degrees
 from amvnet.sensors.normalise import Normaliser
 from amvnet.weights import verdict
@@ -722,13 +722,13 @@ PLACES: dict[str, tuple[object, ...]] = {
     "sensor/ground.js": (ground,),
     "sensor/intensity.js": (intensity,),
     "sensor/normalise.js": (scans, lasers, own_body, frame, built_in),
-    "sensor/rows.js": (sensor_rows, lasers, schema, laser_order),
+    "sensor/rows.js": (sensor_rows, lasers, schema),
 }
 # Those that have other names there.
 OTHERS = {
     "KITTI": raw.KITTI_COLUMNS,
     "NUSCENES": raw.NUSCENES_COLUMNS,
-    "LEAST_POINTS": laser_order.MIN_POINTS,
+    "LEAST_POINTS": lasers.MIN_LASER_POINTS,
     "LEAST_MEASURED": lasers.MIN_POINTS,
     "BINS": len(lasers.ELEVATION_EDGES) - 1,
     "AROUND": lasers.SMOOTHED_BINS // 2,

@@ -20,8 +20,7 @@ from amvnet.sensors.intensity import (
     fill_intensity,
     match_scan,
 )
-from amvnet.sensors.laser_order import lasers_by_order, order_rings
-from amvnet.sensors.lasers import MEASURES, SensorGeometry
+from amvnet.sensors.lasers import MEASURES, SensorGeometry, lasers_by_order, order_rings
 from amvnet.sensors.lidars import ANY, KNOWN_HEIGHTS, KNOWN_SENSORS, Sensor
 
 

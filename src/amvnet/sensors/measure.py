@@ -15,8 +15,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.frame import QUICK_STEP, STEADY_TILT, Frame, find_frame, median_frame
 from amvnet.sensors.ground import MIN_DISTANCE
 from amvnet.sensors.intensity import are_of_one_range, quantiles_of
-from amvnet.sensors.laser_order import order_rings
-from amvnet.sensors.lasers import SensorGeometry, laser_density, measure_lasers
+from amvnet.sensors.lasers import SensorGeometry, laser_density, measure_lasers, order_rings
 from amvnet.sensors.lidars import Sensor
 
 MEASURED_SCANS = 5  # number of measured scans in a recording; later scans get their median

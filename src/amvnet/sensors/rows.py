@@ -11,8 +11,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
 from amvnet.sensors.expectation import Expectation
-from amvnet.sensors.laser_order import lasers_by_order
-from amvnet.sensors.lasers import SensorGeometry, elevations, rows_by_density
+from amvnet.sensors.lasers import SensorGeometry, elevations, lasers_by_order, rows_by_density
 from amvnet.sensors.lidars import ANY, Sensor, rotation_from_degrees
 
 MAX_OUTSIDE_SHARE = 0.16  # limit of the share of the points outside a field of view that suffices

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from amvnet.cli.commands.export import calibration_scans
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.engines.export import int8 as int8_export
 from amvnet.engines.export import onnx as onnx_export
-from amvnet.inference.calibration import calibration_scans
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES

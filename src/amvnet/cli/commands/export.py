@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report
+from amvnet.errors import InputError
+
+if TYPE_CHECKING:
+    from amvnet.scan import Scan
+    from amvnet.weights.file import Weights
 
 
 def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = False) -> None:
@@ -20,7 +26,6 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
     from amvnet.engines.export.onnx import check_libraries, possible_files
     from amvnet.engines.export.onnx import export as export_weights
     from amvnet.files import check_outputs
-    from amvnet.inference.calibration import calibration_scans
     from amvnet.weights.file import load
 
     check_outputs(possible_files(out), [weights, int8], overwrite)
@@ -39,3 +44,34 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
                 f"{name} is in int8; on scans that did not calibrate it, "
                 f"{graph['agreement']:.1%} of its labels are unchanged"
             )
+
+
+def calibration_scans(text: str, weights: Weights) -> list[Scan]:
+    """Read up to `MAX_SCANS` scans, evenly spaced and prepared for the networks, or simulate them.
+
+    Args:
+        text: a dataset, a scan file, a folder of scan files, or `SIMULATED`.
+
+    Raises:
+        InputError: if there are no scans, one is broken, or the weights' sensor cannot be
+            simulated.
+    """
+    from amvnet.data.recordings import evenly_spaced
+    from amvnet.engines.export.int8 import MAX_SCANS, SIMULATED, simulated_scans
+    from amvnet.inference.listing import find_inputs
+
+    if text == SIMULATED:
+        return simulated_scans(weights)
+
+    scans = []
+    for scan_input in evenly_spaced(find_inputs([text]).for_weights(weights), MAX_SCANS):
+        scan = scan_input.load()
+        if scan.valid.any():
+            scans.append(weights.expects.prepare(scan))
+
+    if not scans:
+        raise InputError(
+            f"{text}: expected scans to calibrate with, found none with a finite point; "
+            "name other scans"
+        )
+    return scans

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import uuid4
 
-from amvnet.data.formats import feather, las, numpy_files, packed, pcd, ply, text
+from amvnet.data.formats import feather, las, numpy_files, pcd, ply, text
 from amvnet.data.formats.bags import Bag
-from amvnet.data.formats.cloud import COLUMN_NAMES, Arrays, Cloud, Names, make_cloud
-from amvnet.data.formats.detect import BAGS, FOLDER, GZIP, TEXT
+from amvnet.data.formats.cloud import (
+    COLUMN_NAMES,
+    MAX_BYTES,
+    Arrays,
+    Cloud,
+    Names,
+    make_cloud,
+    reading,
+)
+from amvnet.data.formats.detect import BAGS, FOLDER, GZIP, TEXT, ending_of, named_ending
 from amvnet.data.formats.raw import NUSCENES_ENDING, read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
@@ -20,6 +31,8 @@ from amvnet.errors import InputError, installation, readable
 
 EXTRAS = {"pyarrow": "feather"}  # the extra that installs a package; by default it is `formats`
 OPEN_BAGS = 4  # the number of bags that the process with limits keeps open
+CHUNK = 1 << 20  # number of bytes that are unpacked at a time
+GZIP_ADVICE = "copy it again, or unpack it"
 
 # Readers by the endings of files. ROW_READERS need the layout of rows without names; COLUMN_READERS
 # read named columns.
@@ -153,6 +166,39 @@ def _open(path: Path, ending: str, topic: str | None, _opening: str) -> Bag:
 
 
 def read_gzip(path: Path, columns: list[str], dtypes: list[str]) -> dict[str, Any]:
-    """Return the attributes of the cloud in a file that is packed by gzip."""
-    layout = RowLayout(tuple(columns), tuple(dtypes))
-    return vars(packed.read_gzip(path, partial(read_file, layout=layout)))
+    """Return the attributes of the cloud in a file that is packed by gzip.
+
+    Raises:
+        InputError: if the file is truncated, unpacks to too many bytes, or holds no file of one
+            scan, or one that is packed again. Messages name the packed file.
+    """
+    name_inside = Path(path.name.lower().removesuffix(GZIP))
+    with (
+        reading(path, "a scan file packed by gzip", GZIP_ADVICE),
+        gzip.open(path) as packed,
+        TemporaryDirectory() as folder,
+    ):
+        unpacked = Path(folder) / f"scan{named_ending(name_inside) or ''}"
+        _unpack(packed, unpacked, path)
+        try:
+            ending = ending_of(unpacked)
+            if ending in (*BAGS, GZIP):
+                raise InputError(
+                    f"{path}: expected a file of one scan, found {ending}; {GZIP_ADVICE}"
+                )
+            cloud = read_file(unpacked, ending, RowLayout(tuple(columns), tuple(dtypes)))
+        except InputError as error:  # readers name the file that they read
+            raise InputError(str(error).replace(str(unpacked), str(path))) from None
+    return vars(replace(cloud, name=str(path)))
+
+
+def _unpack(packed: gzip.GzipFile, target: Path, title: Path) -> None:
+    """Unpack a file, which messages call `title`; raise InputError if no scan has so many bytes."""
+    size = 0
+    with target.open("wb") as file:
+        while chunk := packed.read(CHUNK):
+            size += len(chunk)
+            if size > MAX_BYTES:
+                limit = MAX_BYTES >> 20
+                raise InputError(f"{title}: expected at most {limit} MB, found more; {GZIP_ADVICE}")
+            file.write(chunk)
