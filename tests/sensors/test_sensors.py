@@ -367,6 +367,19 @@ def test_a_sensor_that_contradicts_the_scan_is_named(stated: Sensor, words: list
     assert all(word in warnings[0] for word in words)
 
 
+def test_a_tilt_that_is_not_levelled_contradicts_no_lasers() -> None:
+    for up, words in ((15, ""), (10, "+10.0 degrees")):
+        lines: list[str] = []
+        stated = Sensor(fov_up=up, fov_down=-15)
+        points, _ = place(np.linspace(15, -15, 32), 0.9)
+        points[:, :3] = points[:, :3] @ rotation_from_degrees(0, 3, 0).T.astype(np.float32)
+        normaliser = Normaliser(Expectation.of_sensor("hdl64e"), stated, lines.append)
+        normaliser(Recording("drive")).to_scan(make_cloud(points))
+        stating = " ".join(line for line in lines if "you state" in line)
+        assert words in stating
+        assert bool(words) == bool(stating)
+
+
 @pytest.mark.parametrize(
     ("laser", "advice"), [("hdl32e", "sim-hdl32e would fit"), ("vlp16", "sim-any would fit")]
 )

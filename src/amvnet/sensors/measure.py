@@ -67,12 +67,14 @@ class Estimate:
             texts.append(f"{sensor.beams} lasers, the rings are {beams}")
         if self.frame.pitch or self.frame.roll:  # elevations of a levelled scan
             return "; ".join(texts)
-        # The highest lasers may see only the sky, but nothing lies outside the field of view.
+        # The highest lasers may see only the sky, but nothing lies outside the field of view, whose
+        # ends a tilted sensor raises at one side and lowers at the other.
+        largest = OUTSIDE + self.frame.tilt
         for end, seen, sign in (
             (sensor.fov_up, self.lasers.fov_up, 1),
             (sensor.fov_down, self.lasers.fov_down, -1),
         ):
-            if end is not None and seen is not None and sign * (seen - end) > OUTSIDE:
+            if end is not None and seen is not None and sign * (seen - end) > largest:
                 texts.append(
                     f"an end of the lasers at {end:+.1f} degrees, points lie at {seen:+.1f}"
                 )
