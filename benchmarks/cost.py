@@ -59,7 +59,7 @@ def add_rows(table: Table, name: str) -> None:
         millions = sum(parameter.numel() for parameter in net.parameters()) / 1e6
         computed = gmac(net, view)
         with (
-            patch("amvnet.models.range_net.apply_to_joined", convolve_upsampled),
+            patch("amvnet.models.layers.apply_to_joined", convolve_upsampled),
             patch("amvnet.models.polar_net.apply_to_joined", convolve_upsampled),
         ):
             defined = gmac(net, view)

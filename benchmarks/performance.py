@@ -29,7 +29,6 @@ import amvnet.engines.base
 import amvnet.models.amvnet
 import amvnet.models.layers
 import amvnet.models.polar_net
-import amvnet.models.range_net
 from amvnet import read as read_scan
 from amvnet.data.labels.ids import write_ids
 from amvnet.engines.compute import ONNX_ENGINES
@@ -83,7 +82,7 @@ def without_joining() -> None:
         return block(torch.cat([upsample(coarse, fine), fine], dim=1))
 
     amvnet.models.polar_net.apply_to_joined = apply_to_joined  # type: ignore[attr-defined]
-    amvnet.models.range_net.apply_to_joined = apply_to_joined  # type: ignore[attr-defined]
+    amvnet.models.layers.apply_to_joined = apply_to_joined
 
 
 def without_sharing() -> None:

@@ -14,7 +14,7 @@ import pytest
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans
-from amvnet.data.formats import find
+from amvnet.data.formats import detect, find
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import ending_of
 from amvnet.data.formats.registry import read_file
@@ -235,7 +235,7 @@ def test_each_file_is_read_once_and_its_format_detected_once(
         return counted
 
     monkeypatch.setattr(find, "read_file", count(read_file, "read"))
-    monkeypatch.setattr(find, "ending_of", count(ending_of, "detect"))
+    monkeypatch.setattr(detect, "ending_of", count(ending_of, "detect"))
     names = [f"{index}.bin" for index in range(MEASURED_SCANS + 2)]
     (tmp_path / "scans").mkdir()
     for index, name in enumerate(names):

@@ -228,7 +228,7 @@ def test_the_output_is_checked_before_the_networks_are_loaded_and_when_the_run_i
         return load_segmenter(*arguments)
 
     monkeypatch.setattr("amvnet.inference.pipeline.check_outputs", lambda *_: steps.append("check"))
-    monkeypatch.setattr("amvnet.cli.commands.predict.load_segmenter", load)
+    monkeypatch.setattr("amvnet.cli.options.load_segmenter", load)
     succeed(predict(world, tmp_path, options))
     assert steps == ["check", "load", "check"]
 
@@ -543,7 +543,7 @@ def test_a_run_replaces_no_labels_of_a_run_that_ended_while_it_loaded_its_networ
         succeed(predict(world, tmp_path, "--method rv"))
         return load(*arguments)
 
-    monkeypatch.setattr("amvnet.cli.commands.predict.load_segmenter", load_slowly)
+    monkeypatch.setattr("amvnet.cli.options.load_segmenter", load_slowly)
     refused(predict(world, tmp_path), "expected no file")
     (settings,) = read_journals(tmp_path).settings
     assert settings["method"] == "rv"

@@ -15,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import RangeNetConfig
-from amvnet.models import range_net
+from amvnet.models import layers, range_net
 from amvnet.models.layers import (
     ROWS,
     AzimuthGRU,
@@ -240,7 +240,7 @@ def test_the_paper_size_range_net_costs_500_gmac_and_decodes_the_strides_4_to_12
     def convolve_upsampled(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
         return block(joined_maps(coarse, fine))
 
-    monkeypatch.setattr(range_net, "apply_to_joined", convolve_upsampled)
+    monkeypatch.setattr(layers, "apply_to_joined", convolve_upsampled)
     with FlopCounterMode(display=False) as counter:
         assert net(torch.zeros(1, 6, 64, width)).shape == (1, 19, 64, width)
     assert sorted(strides) == [4, 8, 16, 32, 64, 128]

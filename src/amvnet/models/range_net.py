@@ -7,15 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from amvnet.config.schema import RangeNetConfig
+from amvnet.models import layers
 from amvnet.models.cpu_convolution import convolve
-from amvnet.models.layers import (
-    AzimuthGRU,
-    ConvBlock,
-    ResidualBlock,
-    apply_to_joined,
-    upsample,
-    wrap_width,
-)
 from amvnet.models.views.range_view import CHANNELS
 
 FIRST_DECODED_STAGE = 1  # index of the first stage that the decoder uses; its width stride is 4
@@ -34,21 +27,21 @@ class RangeNet(nn.Module):
         self.steps = c.steps
         channels = CHANNELS + STEPS if c.steps else CHANNELS
         self.input_norm = nn.BatchNorm2d(channels)
-        self.stem = ConvBlock(channels, c.stem)
+        self.stem = layers.ConvBlock(channels, c.stem)
         self.stem_blocks = nn.Sequential(*_blocks(c.stem, c.stem_blocks))
         self.stages = nn.ModuleList(_stages(c))
 
         self.recurrent = nn.ModuleList()
         if c.gru:
             self.recurrent.extend(
-                AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT_STAGES:]
+                layers.AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT_STAGES:]
             )
 
         decoded = c.widths[FIRST_DECODED_STAGE:]
-        self.lateral = nn.ModuleList(ConvBlock(w, c.decoder, 1) for w in decoded)
-        self.decoder = nn.ModuleList(ConvBlock(c.decoder, c.decoder) for _ in decoded)
+        self.lateral = nn.ModuleList(layers.ConvBlock(w, c.decoder, 1) for w in decoded)
+        self.decoder = nn.ModuleList(layers.ConvBlock(c.decoder, c.decoder) for _ in decoded)
         self.drop = nn.Dropout2d(c.dropout)
-        self.last = ConvBlock(c.decoder + c.stem, c.head)
+        self.last = layers.ConvBlock(c.decoder + c.stem, c.head)
         self.scores = nn.Conv2d(c.head, classes, 1)
 
     def forward(self, image: Tensor) -> Tensor:
@@ -62,7 +55,7 @@ class RangeNet(nn.Module):
         full = self.stem_blocks(full)  # (B, stem, H, W)
         maps = self.encode(full)
         decoded = self.decode(maps[FIRST_DECODED_STAGE:])  # (B, decoder, H, W / 4)
-        x = apply_to_joined(self.last, decoded, full)
+        x = layers.apply_to_joined(self.last, decoded, full)
         return convolve(x, self.scores.weight, self.scores.bias, stride=(1, 1), padding=(0, 0))
 
     def encode(self, x: Tensor) -> list[Tensor]:
@@ -89,7 +82,7 @@ class RangeNet(nn.Module):
         for x, lateral, conv in reversed(list(zip(maps, self.lateral, self.decoder, strict=True))):
             side = lateral(x)
             if decoded is not None:
-                side = side + upsample(decoded, side)
+                side = side + layers.upsample(decoded, side)
             decoded = self.drop(conv(side))
 
         assert decoded is not None
@@ -114,7 +107,7 @@ def surface_steps(image: Tensor) -> Tensor:
     surface = torch.cat([(x * x + y * y).sqrt(), z, mask], dim=1)
 
     # The left and right ends of the image meet. Above and below it, there are no points.
-    ring = wrap_width(surface, 1, 1)
+    ring = layers.wrap_width(surface, 1, 1)
     across = _steps(ring[..., :-1], ring[..., 1:])  # (B, 2, H, W + 1)
     column = F.pad(surface, (0, 0, 1, 1))
     down = _steps(column[..., :-1, :], column[..., 1:, :])  # (B, 2, H + 1, W)
@@ -134,12 +127,12 @@ def _stages(c: RangeNetConfig) -> list[nn.Module]:
     stages: list[nn.Module] = []
     channels = c.stem
     for width, blocks, stride in zip(c.widths, c.blocks, c.height_strides, strict=True):
-        first = ResidualBlock(channels, width, (stride, 2))
+        first = layers.ResidualBlock(channels, width, (stride, 2))
         stages.append(nn.Sequential(first, *_blocks(width, blocks - 1)))
         channels = width
 
     return stages
 
 
-def _blocks(channels: int, count: int) -> list[ResidualBlock]:
-    return [ResidualBlock(channels, channels) for _ in range(count)]
+def _blocks(channels: int, count: int) -> list[layers.ResidualBlock]:
+    return [layers.ResidualBlock(channels, channels) for _ in range(count)]

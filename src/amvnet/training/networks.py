@@ -19,19 +19,9 @@ from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import counted
 from amvnet.sensors.expectation import Expectation
+from amvnet.training import losses
 from amvnet.training.checking import Checked
 from amvnet.training.loaders import ScanSet, make_loader
-from amvnet.training.losses import (
-    RegionLoss,
-    Scored,
-    class_weights,
-    dice,
-    distillation_loss,
-    lovasz_softmax,
-    majority_labels,
-    network_loss,
-    rival_classes,
-)
 from amvnet.training.muon import Muon
 from amvnet.training.plan import Plan
 from amvnet.training.stage import HALF, MIXED, Loaders, Stage, StageContext, fit
@@ -40,7 +30,7 @@ from amvnet.weights.file import Weights
 Batch = tuple[PointBatch, Tensor, Tensor]  # points, their (P,) train ids and (P,) sources
 # The types in which the networks of a mixed precision compute.
 LOWER = {MIXED: torch.bfloat16, HALF: torch.float16}
-REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
+REGION_LOSSES: dict[str, losses.RegionLoss] = {"dice": losses.dice, "lovasz": losses.lovasz_softmax}
 
 
 class NetworkStage(Stage):
@@ -58,7 +48,7 @@ class NetworkStage(Stage):
 
     config: NetworkTraining
     view: RangeView | PolarView
-    default_region_loss: RegionLoss  # the region loss that the paper uses
+    default_region_loss: losses.RegionLoss  # the region loss that the paper uses
 
     def __init__(
         self,
@@ -96,7 +86,7 @@ class NetworkStage(Stage):
             logits: Tensor = net(view)
         return logits.to(self.dtype)
 
-    def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
+    def compare(self, batch: Batch, net: nn.Module | None = None) -> losses.Scored:
         """Return the pixels or voxels that the loss compares with their labels.
 
         Args:
@@ -108,19 +98,19 @@ class NetworkStage(Stage):
         """Return scores (P, K) of the P points of some scans, the largest for their class."""
         raise NotImplementedError
 
-    def loss(self, scored: Scored) -> Tensor:
+    def loss(self, scored: losses.Scored) -> Tensor:
         """Return the mean loss over the scans, so that a batch may be split into parts."""
         region_loss = REGION_LOSSES.get(self.config.region_loss, self.default_region_loss)
         weights = self.class_weights
-        return network_loss(scored, weights, self.config.region, region_loss, self.rivals)
+        return losses.network_loss(scored, weights, self.config.region, region_loss, self.rivals)
 
-    def distillation(self, teacher: nn.Module, batch: Batch, scored: Scored) -> Tensor:
+    def distillation(self, teacher: nn.Module, batch: Batch, scored: losses.Scored) -> Tensor:
         """Return the `distillation_loss` of a batch."""
         assert self.rivals is not None
         teacher.to(batch[0].points)  # their type and device
         with torch.no_grad():
             expected = self.compare(batch, teacher)
-        return distillation_loss(scored, expected.logits, self.rivals)
+        return losses.distillation_loss(scored, expected.logits, self.rivals)
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         points, _, _ = batch
@@ -191,9 +181,9 @@ class RangeStage(NetworkStage):
 
     name = "rv"
     view: RangeView
-    default_region_loss = staticmethod(dice)
+    default_region_loss = staticmethod(losses.dice)
 
-    def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
+    def compare(self, batch: Batch, net: nn.Module | None = None) -> losses.Scored:
         points, labels, source = batch
         view = self.view.project(points)
         image = self.in_precision(net or self.trained, view.image)  # (B, K, H, W)
@@ -202,7 +192,7 @@ class RangeStage(NetworkStage):
         # Pixels without a point have no label.
         index = (view.nearest >= 0).nonzero()[:, 0]
         shown = view.nearest[index]
-        return Scored(
+        return losses.Scored(
             logits=pixels.index_select(0, index),
             labels=labels[shown],
             scan=index // (len(pixels) // points.count),
@@ -220,9 +210,9 @@ class PolarStage(NetworkStage):
 
     name = "bev"
     view: PolarView
-    default_region_loss = staticmethod(lovasz_softmax)
+    default_region_loss = staticmethod(losses.lovasz_softmax)
 
-    def compare(self, batch: Batch, net: nn.Module | None = None) -> Scored:
+    def compare(self, batch: Batch, net: nn.Module | None = None) -> losses.Scored:
         points, labels, source = batch
         view = self.view.project(points)
         logits = self.in_precision(net or self.trained, view)
@@ -233,7 +223,7 @@ class PolarStage(NetworkStage):
         return view.to_points(self.in_precision(self.trained, view))
 
 
-def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tensor) -> Scored:
+def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tensor) -> losses.Scored:
     """Return the voxels that have points, each with the most frequent label of its points.
 
     A voxel with points of several datasets has the first of them as its source.
@@ -248,12 +238,12 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor, source: Tenso
     voxels, (cells,) = occurring(len(logits), view.slot * vertical + view.voxel)
     voxel_logits = logits.index_select(0, voxels)
     classes = logits.shape[1]
-    voxel_labels = majority_labels(cells, labels, count=len(voxels), classes=classes)
+    voxel_labels = losses.majority_labels(cells, labels, count=len(voxels), classes=classes)
 
     scan = view.occupied[voxels // vertical] // (radial * angular)
     voxel_source = source.new_zeros(len(voxels))
     voxel_source.scatter_reduce_(0, cells, source, "amin", include_self=False)
-    return Scored(
+    return losses.Scored(
         logits=voxel_logits, labels=voxel_labels, scan=scan, scans=scans, source=voxel_source
     )
 
@@ -269,8 +259,8 @@ def train_network(plan: Plan, checked: Checked, name: NetworkName, weights: Weig
     loaders = make_loaders(plan, config, weights.expects)
     # The class weights of the loss (section 4.2 of the paper).
     power = config.class_weights
-    loss_weights = class_weights(checked.class_counts, power) if power else None
-    rivals = rival_classes(checked.taught)
+    loss_weights = losses.class_weights(checked.class_counts, power) if power else None
+    rivals = losses.rival_classes(checked.taught)
     for line in _notes(plan, name, checked.taught, rivals):
         plan.report(line)
 

@@ -6,15 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from amvnet.cli import options
 from amvnet.cli.console import on_terminal, progress, report
-from amvnet.cli.options import (
-    LabelChoice,
-    LabelledChoice,
-    ScanChoice,
-    SensorChoice,
-    load_segmenter,
-    open_inputs,
-)
 from amvnet.config.bounds import Count, Seed, Share
 from amvnet.engines.compute import Compute, resolved
 from amvnet.errors import InputError
@@ -31,8 +24,8 @@ def adapt(
     inputs: list[str],
     /,
     out: Path,
-    choice: ScanChoice,
-    sensor_choice: SensorChoice,
+    choice: options.ScanChoice,
+    sensor_choice: options.SensorChoice,
     compute: Compute,
     weights: str = AUTO,
     poses: Path | None = None,
@@ -80,10 +73,10 @@ def adapt(
         raise InputError("--poses: expected no --loose, whose scans are no drive; leave one out")
     if val_sequences and not val:
         raise InputError("--val-sequences: expected --val, found none; add it")
-    found, weights, loaded = open_inputs(inputs, choice, sensor_choice, weights)
+    found, weights, loaded = options.open_inputs(inputs, choice, sensor_choice, weights)
     check_method("amvnet", loaded.parts)
     scans = found.for_weights(loaded, report)
-    request = LabelChoice().parse(loaded, found.reading, resolved(compute))
+    request = options.LabelChoice().parse(loaded, found.reading, resolved(compute))
     recipe = recipe_for(loaded, epochs, streets, seed)
     drives = None
     if not loose:
@@ -91,7 +84,7 @@ def adapt(
             drives = find_poses(scans, poses, progress=step, report=report)
 
     def make_segmenter(chosen: Weights) -> Segmenter:
-        return load_segmenter(chosen, "amvnet", compute)
+        return options.load_segmenter(chosen, "amvnet", compute)
 
     def make_plan(dataset: Dataset) -> Plan:
         sources = [Source(dataset, choose_records(dataset, None, "all"))]
@@ -132,7 +125,7 @@ def _score_on(
     from amvnet.sensors.normalise import Normaliser, normalised
 
     dataset = normalised(open_dataset(val, weights.taxonomy), Normaliser(weights.expects))
-    records = LabelledChoice("all", sequences).records(dataset)
+    records = options.LabelledChoice("all", sequences).records(dataset)
 
     def score(segmenter: Segmenter) -> float:
         labeller = label_by_weights(segmenter, ["amvnet"])

@@ -7,15 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from amvnet.cli import options
 from amvnet.cli.console import progress, report, show
-from amvnet.cli.options import (
-    DriveChoice,
-    LabelledChoice,
-    join_processes,
-    load_dataset,
-    load_segmenter,
-    map_to,
-)
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute, choose_device
 from amvnet.errors import InputError
@@ -32,9 +25,9 @@ if TYPE_CHECKING:
 def evaluate(
     data: str,
     /,
-    choice: LabelledChoice,
+    choice: options.LabelledChoice,
     compute: Compute,
-    drive_choice: DriveChoice,
+    drive_choice: options.DriveChoice,
     weights: str | None = None,
     predictions: Path | None = None,
     methods: tuple[MethodName, ...] = PAPER_METHODS,
@@ -79,13 +72,13 @@ def evaluate(
             outputs[json] = REPORT
         check_outputs(outputs, [data, weights, classes], overwrite)
 
-    processes = join_processes()
+    processes = options.join_processes()
     drives = None
     if weights is not None and predictions is not None:
         raise InputError("expected --weights or --predictions, found both; give one of them")
     if predictions is None:
-        weights, loaded, dataset = load_dataset(data, weights or AUTO, classes is not None)
-        mapping = map_to(classes, loaded.taxonomy, dataset.taxonomy)
+        weights, loaded, dataset = options.load_dataset(data, weights or AUTO, classes is not None)
+        mapping = options.map_to(classes, loaded.taxonomy, dataset.taxonomy)
         records = choice.records(dataset)
         check_files(records)
         drives = _find_drives(drive_choice, dataset, records, processes.size)
@@ -94,7 +87,7 @@ def evaluate(
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]
         device = processes.device(choose_device(compute.device, compute.engine))
         compute = replace(compute, device=device)
-        segmenter = load_segmenter(loaded, widest_method(parts), compute, tau)
+        segmenter = options.load_segmenter(loaded, widest_method(parts), compute, tau)
         labeller = label_by_weights(segmenter, methods, mapping)
     else:
         for flag, is_given in (("--tau", tau is not None), ("--drive", drive_choice.drive)):
@@ -103,7 +96,7 @@ def evaluate(
                     f"{flag}: expected --weights, found --predictions; leave {flag} out"
                 )
         dataset = open_dataset(data)
-        mapping = map_to(classes, dataset.taxonomy)
+        mapping = options.map_to(classes, dataset.taxonomy)
         records = choice.records(dataset)
         check_files(records)
         labeller = label_from_files(dataset, predictions, mapping)
@@ -121,7 +114,7 @@ def evaluate(
 
 
 def _find_drives(
-    choice: DriveChoice, dataset: Dataset, records: Sequence[ScanFile], processes: int
+    choice: options.DriveChoice, dataset: Dataset, records: Sequence[ScanFile], processes: int
 ) -> Drives | None:
     """Return the poses of the scans, if their scores are to be fused over time.
 
@@ -130,13 +123,13 @@ def _find_drives(
     """
     from amvnet.inference.drive import find_poses
 
-    options = choice.parse()
-    if options is None:
+    drive = choice.parse()
+    if drive is None:
         return None
     if processes > 1:
         raise InputError("--drive: expected one process, found several; start it without torchrun")
     with progress("poses") as step:
-        return find_poses(records, options.poses, options.past_only, progress=step, report=report)
+        return find_poses(records, drive.poses, drive.past_only, progress=step, report=report)
 
 
 def _check_methods(methods: tuple[MethodName, ...], weights: str, parts: tuple[str, ...]) -> None:

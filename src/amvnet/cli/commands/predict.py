@@ -6,16 +6,8 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from amvnet.cli import options
 from amvnet.cli.console import progress, report, show
-from amvnet.cli.options import (
-    DriveChoice,
-    LabelChoice,
-    ScanChoice,
-    SensorChoice,
-    given_options,
-    load_segmenter,
-    open_inputs,
-)
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute, resolved
 from amvnet.errors import InputError
@@ -31,11 +23,11 @@ if TYPE_CHECKING:
 def predict(
     inputs: list[str],
     /,
-    choice: ScanChoice,
-    sensor_choice: SensorChoice,
+    choice: options.ScanChoice,
+    sensor_choice: options.SensorChoice,
     compute: Compute,
-    labels: LabelChoice,
-    drive_choice: DriveChoice,
+    labels: options.LabelChoice,
+    drive_choice: options.DriveChoice,
     weights: str = AUTO,
     out: str = "labels",
     batch: Count = 1,
@@ -71,13 +63,13 @@ def predict(
     compute = resolved(compute)  # the labels depend on what "auto" is
     drive = drive_choice.parse()
     where = f"; labels go to {out}"
-    found, weights, loaded = open_inputs(inputs, choice, sensor_choice, weights, where)
+    found, weights, loaded = options.open_inputs(inputs, choice, sensor_choice, weights, where)
     request = labels.parse(loaded, found.reading, compute, *found.taxonomies)
     is_new = not (Path(out) / JOURNAL).exists()
     also_read = (*inputs, weights, labels.classes, sensor_choice.sensor, drive_choice.poses)
 
     def make_segmenter() -> Segmenter:
-        return load_segmenter(request.weights, request.method, compute, request.tau)
+        return options.load_segmenter(request.weights, request.method, compute, request.tau)
 
     entries, faults = predict_inputs(
         found,
@@ -102,18 +94,18 @@ def predict(
     check_faults(faults, len(entries) + len(faults))
     report(f"{counted(len(entries), 'label file')} in {out}")
     if is_new:  # else the user has seen these lines
-        options = [*given_options(choice), *given_options(sensor_choice)]
-        look = _words_to_look(inputs, options, weights, out, labels, request.taxonomy, entries)
+        given = [*options.given_options(choice), *options.given_options(sensor_choice)]
+        look = _words_to_look(inputs, given, weights, out, labels, request.taxonomy, entries)
         report(f"look at them: {shlex.join(['amvnet', 'view', *look])}")
         _report_training(inputs, weights)
 
 
 def _words_to_look(
     inputs: list[str],
-    options: list[str],
+    given: list[str],
     weights: str,
     out: str,
-    labels: LabelChoice,
+    labels: options.LabelChoice,
     written: Taxonomy,
     entries: list[Entry],
 ) -> list[str]:
@@ -126,10 +118,10 @@ def _words_to_look(
         name = entries[0].scan.removesuffix(".npz")
         return [str(Path(out) / f"{name}.{labels.format}")]  # it names its classes
     if labels.classes is not None:
-        return [*inputs, *options, "--labels", out, "--classes", labels.classes]
+        return [*inputs, *given, "--labels", out, "--classes", labels.classes]
     if TAXONOMIES.get(written.name) == written:
-        return [*inputs, *options, "--labels", out, "--taxonomy", written.name]
-    return [*inputs, *options, "--weights", weights]  # `view` knows no other classes of label files
+        return [*inputs, *given, "--labels", out, "--taxonomy", written.name]
+    return [*inputs, *given, "--weights", weights]  # `view` knows no other classes of label files
 
 
 def _report_training(inputs: list[str], weights: str) -> None:

@@ -5,14 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from amvnet.cli import options
 from amvnet.cli.console import on_terminal, report
-from amvnet.cli.options import (
-    ScoresChoice,
-    TrainingChoice,
-    describe_records,
-    join_processes,
-    report_unused,
-)
 from amvnet.config.schema import BOTH_NETWORKS, Recipe
 
 
@@ -21,8 +15,8 @@ def train(
     /,
     data: list[str],
     out: Path,
-    choice: TrainingChoice,
-    models: ScoresChoice,
+    choice: options.TrainingChoice,
+    models: options.ScoresChoice,
     stage: Literal["rv", "bev", "head", "all"] = "all",
     init: str | None = None,
     resume: bool = False,
@@ -60,7 +54,7 @@ def train(
         # Refuse a folder with another run now, because reading all scans takes long.
         for name in recipe.stages if stage == "all" else (stage,):
             RunFolder(out).stages[name].check_begun()
-    processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
+    processes = options.join_processes(device_of(recipe.training.accelerator) == "cuda")
     plan = Plan.open(
         recipe,
         data,
@@ -76,9 +70,9 @@ def train(
         also_read=(*data, init),
     )
     for other in plan.data.sources[1:]:  # `choose` has reported on the first one
-        report_unused(other, f"{other.dataset.spec}: ")
-    trained_on = describe_records(plan.data.train)
-    report(f"training on {trained_on}; validating on {describe_records(plan.data.val)}")
+        options.report_unused(other, f"{other.dataset.spec}: ")
+    trained_on = options.describe_records(plan.data.train)
+    report(f"training on {trained_on}; validating on {options.describe_records(plan.data.val)}")
 
     trained = train_stages(plan)
     line = f"weights in {trained}"

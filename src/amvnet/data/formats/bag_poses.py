@@ -12,15 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.data.formats.bags import (
-    ADVICE,
-    EXPECTED,
-    LISTED_TOPICS,
-    TF_TYPE,
-    Bag,
-    deserialiser,
-    open_reader,
-)
+from amvnet.data.formats import bags
 from amvnet.data.formats.cloud import reading
 from amvnet.data.formats.reader_process import call
 from amvnet.data.poses import Poses, timed_poses
@@ -28,7 +20,7 @@ from amvnet.errors import InputError, readable, shown
 from amvnet.progress import Reporter
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
-TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")  # the second one is an older name
+TF_TYPES = (bags.TF_TYPE, "tf/msg/tfMessage")  # the second one is an older name
 POSE_TYPES = (
     ODOMETRY_TYPE,
     "geometry_msgs/msg/PoseStamped",
@@ -83,7 +75,7 @@ class BagPoses:
         """
         types = self._types()
         if topic not in types:
-            listed = sorted(types.items())[:LISTED_TOPICS]
+            listed = sorted(types.items())[: bags.LISTED_TOPICS]
             listing = ", ".join(f"{other} ({msgtype})" for other, msgtype in listed)
             raise InputError(
                 f"{self.path}: expected the topic {topic} with poses, or a file of this name, "
@@ -235,12 +227,12 @@ def _climb(
 
 def read_times(path: Path, ending: str, scan_topic: str | None) -> dict[str, Any]:
     """Return the time stamps (N,) of the scans in seconds."""
-    return {"times": Bag(path, ending, scan_topic).headers()[0]}
+    return {"times": bags.Bag(path, ending, scan_topic).headers()[0]}
 
 
 def pose_topics(path: Path, ending: str) -> dict[str, dict[str, str]]:
     """Return the types of the topics with poses, by the topics' names."""
-    with reading(path, EXPECTED, ADVICE), closing(open_reader(path, ending)) as bag:
+    with reading(path, bags.EXPECTED, bags.ADVICE), closing(bags.open_reader(path, ending)) as bag:
         return {"types": {each.topic: each.msgtype for each in _with_poses(bag.connections)}}
 
 
@@ -256,18 +248,21 @@ def read_transforms(path: Path, ending: str, scan_topic: str | None, topic: str)
         `rows`: (M, 8) time x y z qx qy qz qw of all messages, seconds and metres.
         `edge_of_row`: (M,) the index of the transform that a row belongs to.
     """
-    times, frame = Bag(path, ending, scan_topic).headers()
-    deserialise = deserialiser(ending == ".bag")
+    times, frame = bags.Bag(path, ending, scan_topic).headers()
+    deserialise = bags.deserialiser(ending == ".bag")
     edges: dict[tuple[str, str, str], int] = {}
     edge_of_row = array("q")
     rows = array("d")
-    with reading(f"{path} ({topic})", EXPECTED, ADVICE), closing(open_reader(path, ending)) as bag:
+    with (
+        reading(f"{path} ({topic})", bags.EXPECTED, bags.ADVICE),
+        closing(bags.open_reader(path, ending)) as bag,
+    ):
         connections = _with_poses(bag.connections)
         sources = {each.topic: _source_of(each) for each in connections}
         wanted = (STATIC, TF) if sources[topic] == GIVEN else (STATIC,)
         chosen = [each for each in connections if each.topic == topic or _source_of(each) in wanted]
         for connection, _, data in bag.messages(connections=chosen):
-            msgtype = TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
+            msgtype = bags.TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
             for parent, child, *row in _poses_of(deserialise(data, msgtype)):
                 edge = (parent.strip("/"), child.strip("/"), sources[connection.topic])
                 edge_of_row.append(edges.setdefault(edge, len(edges)))

@@ -11,20 +11,9 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from amvnet.data.formats import detect
 from amvnet.data.formats.bag_poses import BagPoses
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.detect import (
-    BAGS,
-    ENDINGS,
-    FOLDER,
-    GZIP,
-    METADATA,
-    TEXT,
-    ending_of,
-    is_dead_link,
-    named_ending,
-    scan_stem,
-)
 from amvnet.data.formats.registry import open_bag, read_file
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_comma_table, find_table, read_head
@@ -46,7 +35,7 @@ def find_scans(path: Path | str) -> list[Path]:
         InputError: if nothing has this name, or there is no scan.
     """
     path = Path(path)
-    if path.is_file() or is_bag_folder(path) or is_dead_link(path):
+    if path.is_file() or is_bag_folder(path) or detect.is_dead_link(path):
         return [path]
 
     if path.is_dir():
@@ -60,7 +49,7 @@ def find_scans(path: Path | str) -> list[Path]:
 
     if not paths:
         raise InputError(
-            f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; "
+            f"{path}: expected scan files ({', '.join(detect.ENDINGS)}), found none in it; "
             f"{_advice_to_find(path)}"
         )
     return paths
@@ -92,12 +81,12 @@ def list_scans(
     folders = {} if folders is None else folders
     for file in files:
         # Files in different folders can have the same name.
-        name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
+        name = (file.parent.relative_to(folder) / detect.scan_stem(file)).as_posix()
 
         try:
             scans = _scans_of(file, name, topic, layout, folders)
         except InputError as error:
-            if is_alone and len(files) == 1 and not is_dead_link(file):
+            if is_alone and len(files) == 1 and not detect.is_dead_link(file):
                 raise
             refuse = partial(_refuse, str(error))
             recording = Recording(str(file))
@@ -124,13 +113,13 @@ def _scans_of(
     layout: RowLayout,
     folders: dict[str, Recording],
 ) -> list[ScanFile]:
-    ending = ending_of(file)
-    if ending not in (FOLDER, *BAGS):
+    ending = detect.ending_of(file)
+    if ending not in (detect.FOLDER, *detect.BAGS):
         read = partial(read_file, file, ending, layout)
         source = str(file.parent / f"*{ending}")
-        if ending == GZIP:
-            ending = named_ending(Path(file.name.lower().removesuffix(GZIP))) or ""
-            source = str(file.parent / f"*{ending}{GZIP}")
+        if ending == detect.GZIP:
+            ending = detect.named_ending(Path(file.name.lower().removesuffix(detect.GZIP))) or ""
+            source = str(file.parent / f"*{ending}{detect.GZIP}")
         recording = folders.setdefault(source, Recording(source))
         place = f"{name}.label"
         return [ScanFile(name, recording, file, prediction=place, ending=ending, read=read)]
@@ -230,7 +219,7 @@ def _advice_to_find(path: Path) -> str:
 
 def is_bag_folder(path: Path) -> bool:
     """Return whether a folder is a ROS 2 bag."""
-    if not (path / METADATA).is_file():
+    if not (path / detect.METADATA).is_file():
         return False
     return any(path.glob("*.db3*")) or any(path.glob("*.mcap*"))
 
@@ -248,13 +237,13 @@ def is_scan_name(name: str) -> bool:
     """Return whether a scan or a bag has such a name; false for text files, which hold anything."""
     if name.startswith(".") or name.endswith(".uncertain.npy"):
         return False
-    ending = named_ending(Path(name))
-    return ending is not None and ending not in TEXT
+    ending = detect.named_ending(Path(name))
+    return ending is not None and ending not in detect.TEXT
 
 
 def _is_text_scan(path: Path) -> bool:
     """Return whether a path is a text file of points; files of poses are not."""
-    is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
+    is_text = path.name.lower().endswith(detect.TEXT) and not path.name.startswith(".")
     if not is_text or not path.is_file():
         return False
     head = read_head(path)

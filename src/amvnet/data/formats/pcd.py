@@ -13,14 +13,7 @@ from typing import BinaryIO
 import lzf
 import numpy as np
 
-from amvnet.data.formats.cloud import (
-    MAX_BYTES,
-    Arrays,
-    Names,
-    check_point_count,
-    reading,
-    require_columns,
-)
+from amvnet.data.formats import cloud
 from amvnet.data.formats.fields import Fields, read_header_line
 from amvnet.errors import InputError
 
@@ -41,7 +34,7 @@ LONGEST_REPETITION = 264
 REPETITION_CODE = 3
 
 
-def read_columns(path: Path, wanted: Names) -> Arrays:
+def read_columns(path: Path, wanted: cloud.Names) -> cloud.Arrays:
     """Read some fields of all points; if a field has several values, read only the first.
 
     The points of an organised cloud (a grid) come row by row.
@@ -49,20 +42,20 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
     Raises:
         InputError: if the file is not PCD, is truncated or lacks a field.
     """
-    with reading(path, KIND, ADVICE), path.open("rb") as file:
+    with cloud.reading(path, KIND, ADVICE), path.open("rb") as file:
         entries = _read_header(file, path)
         fields = _parse_fields(entries)
-        chosen = require_columns(fields.names, path, wanted)
+        chosen = cloud.require_columns(fields.names, path, wanted)
         points = _count_points(entries)
         encoding = entries["DATA"][0].lower()
 
         if encoding == "ascii":
             # Each value takes at least one character, and another character separates two values.
-            check_point_count(points, path, 2 * sum(fields.counts) * points - 1)
+            cloud.check_point_count(points, path, 2 * sum(fields.counts) * points - 1)
             return fields.read_text(file, points, chosen, path)
 
         if encoding == "binary":
-            check_point_count(points, path, file.tell() + points * fields.record.itemsize)
+            cloud.check_point_count(points, path, file.tell() + points * fields.record.itemsize)
             return fields.read_binary(file, points, chosen)
         if encoding == "binary_compressed":
             return _read_compressed(file, fields, points, chosen, path)
@@ -112,13 +105,13 @@ def _count_points(entries: dict[str, list[str]]) -> int:
 
 def _read_compressed(
     file: BinaryIO, fields: Fields, points: int, chosen: dict[str, int], path: Path
-) -> Arrays:
+) -> cloud.Arrays:
     """Read the first value of the chosen fields (indices by key) from packed points."""
     packed_size, size = struct.unpack("<II", file.read(8))
-    check_point_count(points, path, file.tell() + packed_size)
+    cloud.check_point_count(points, path, file.tell() + packed_size)
     expected = points * fields.record.itemsize
-    if size != expected or size > MAX_BYTES:
-        expected = min(expected, MAX_BYTES)
+    if size != expected or size > cloud.MAX_BYTES:
+        expected = min(expected, cloud.MAX_BYTES)
         raise InputError(f"{path}: expected {expected} bytes of points, found {size}; {ADVICE}")
     if size * REPETITION_CODE > packed_size * LONGEST_REPETITION:
         raise InputError(

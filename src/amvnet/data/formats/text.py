@@ -10,16 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import (
-    MAX_POINTS,
-    Arrays,
-    Cloud,
-    Names,
-    check_point_count,
-    find_columns,
-    reading,
-    require_columns,
-)
+from amvnet.data.formats import cloud
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
@@ -57,7 +48,7 @@ class TextTable:
     names: tuple[str, ...] = ()
 
 
-def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
+def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> cloud.Cloud:
     """Read a point from each line.
 
     If a line before the points names the columns, they are found by their names. Otherwise they are
@@ -71,12 +62,12 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         InputError: if there are no lines of three or more numbers, or a later line does not have
             the same columns.
     """
-    with reading(path, EXPECTED, ADVICE):
+    with cloud.reading(path, EXPECTED, ADVICE):
         table = _require_table(path)
         names = layout.columns or table.names
 
         if names:
-            indices = sorted(find_columns(names).values())
+            indices = sorted(cloud.find_columns(names).values())
             if max(indices) >= table.count:
                 raise InputError(
                     f"{path}: expected {len(names)} columns ({','.join(names)}), "
@@ -92,12 +83,12 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         return named_cloud(list(values.T), names, str(path), note)
 
 
-def read_columns(path: Path, wanted: Names) -> Arrays:
+def read_columns(path: Path, wanted: cloud.Names) -> cloud.Arrays:
     """Read some columns of all points as float64; columns without names are named "0", "1", ..."""
-    with reading(path, EXPECTED, ADVICE):
+    with cloud.reading(path, EXPECTED, ADVICE):
         table = _require_table(path)
         names = table.names or tuple(map(str, range(table.count)))
-        chosen = require_columns(names, path, wanted)
+        chosen = cloud.require_columns(names, path, wanted)
         values = _read_values(path, table, list(chosen.values()))
         return dict(zip(chosen, values.T, strict=True))
 
@@ -164,7 +155,7 @@ def _match(lines: list[str], separator: str | None) -> TextTable | None:
             return TextTable(separator, skipped, len(values), names)
 
         candidates = tuple(map(_clean_name, _split(_uncomment(line), separator)))
-        if {"x", "y", "z"} <= set(find_columns(candidates)):
+        if {"x", "y", "z"} <= set(cloud.find_columns(candidates)):
             names = candidates
     return None
 
@@ -200,7 +191,7 @@ def _are_numbers(values: list[str], names: tuple[str, ...]) -> bool:
     if len(values) < 3:
         return False
     if len(names) == len(values):
-        values = [values[index] for index in find_columns(names).values()]
+        values = [values[index] for index in cloud.find_columns(names).values()]
 
     try:
         for value in values:
@@ -217,11 +208,11 @@ def _read_values(path: Path, table: TextTable, indices: range | list[int]) -> np
             islice(file, table.skipped, None),
             delimiter=table.separator,
             usecols=list(indices),
-            max_rows=MAX_POINTS + 1,
+            max_rows=cloud.MAX_POINTS + 1,
             comments="#",
             quotechar='"',
             ndmin=2,
         )
-    check_point_count(len(values), path)
+    cloud.check_point_count(len(values), path)
 
     return values
