@@ -232,7 +232,7 @@ def timed_poses(name: str, table: NDArray[np.float64]) -> Trajectory:
     return Trajectory(name, poses, table[:, 0])
 
 
-def as_pose(value: object, name: str) -> Poses:
+def as_pose(value: object) -> Poses:
     """Return the pose (4, 4) that a user gives as an array; raise InputError if it is none."""
     try:
         pose = np.asarray(value, np.float64)
@@ -241,9 +241,9 @@ def as_pose(value: object, name: str) -> Poses:
         pose, found = np.empty(0), shown(value)
     if pose.shape != (4, 4):
         raise InputError(
-            f"{name}: expected an array (4, 4) for each scan, found {found}; give (N, 4, 4) in all"
+            f"poses: expected an array (4, 4) for each scan, found {found}; give (N, 4, 4) in all"
         )
-    check_rigid(pose[None], name)
+    check_rigid(pose[None], "poses")
     return pose
 
 

@@ -186,7 +186,7 @@ def drive(
             than scans, the poses jump, or kiss-icp is missing.
     """
     if isinstance(poses, Sequence | np.ndarray) and len(poses) > 1:
-        poses = [as_pose(pose, "poses") for pose in poses]
+        poses = [as_pose(pose) for pose in poses]
         check_steps(np.array(poses), list(map(str, range(len(poses)))), "poses", OTHER_POSES)
 
     def segmented() -> Iterator[DriveScan[Segmentation]]:
@@ -204,7 +204,7 @@ def drive(
                     raise InputError(
                         f"poses: expected a pose for each scan, found {index}; give one for each"
                     )
-                pose = as_pose(found, "poses") @ to_file(scan)
+                pose = as_pose(found) @ to_file(scan)
             yield DriveScan(result, scan.points[:, :3], result.scores, pose)
 
     for result, scores in Consensus(past_only=past_only).stream(segmented()):

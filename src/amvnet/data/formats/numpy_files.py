@@ -14,19 +14,7 @@ from typing import BinaryIO, cast
 
 import numpy as np
 
-from amvnet.data.formats.cloud import (
-    COLUMN_NAMES,
-    MAX_BYTES,
-    Arrays,
-    Cloud,
-    Names,
-    check_point_count,
-    find_columns,
-    make_cloud,
-    reading,
-    require_columns,
-    ring_indices,
-)
+from amvnet.data.formats import cloud
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
@@ -40,17 +28,17 @@ ADVICE = "save it again with np.save"
 ARCHIVE_ADVICE = "save it again with np.savez"
 
 
-def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
+def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> cloud.Cloud:
     """Read the points of an array file.
 
     Raises:
         InputError: if the file holds no array of numbers, has an unsuitable shape or is truncated.
     """
-    with reading(path, "a plain NumPy array", ADVICE):
+    with cloud.reading(path, "a plain NumPy array", ADVICE):
         return _to_cloud(read_array(path), path, layout)
 
 
-def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
+def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> cloud.Cloud:
     """Read the points of an archive.
 
     The points are the only array, or the array named `points`, `positions` (Open3D), `xyz`, `scan`
@@ -60,9 +48,9 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     Raises:
         InputError: if the file is no archive of NumPy, is truncated, or holds no points.
     """
-    with reading(path, "a NumPy archive", ARCHIVE_ADVICE):
+    with cloud.reading(path, "a NumPy archive", ARCHIVE_ADVICE):
         names = member_names(path)
-        arrays = find_columns(names)
+        arrays = cloud.find_columns(names)
         columns = {}
         if {"x", "y", "z"} <= set(arrays):
             lengths = {}
@@ -74,32 +62,32 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
                 raise InputError(
                     f"{path}: expected columns of one length, found {lengths}; {ARCHIVE_ADVICE}"
                 )
-            return make_cloud(columns, str(path))
+            return cloud.make_cloud(columns, str(path))
 
         points = read_array(path, _choose_member(names, path))
-        cloud = _to_cloud(points, path, layout)
+        found = _to_cloud(points, path, layout)
         for key in {"intensity", "ring"} & set(arrays):
             values = read_array(path, names[arrays[key]]).ravel()
             # An array of another size describes something else, such as the lasers.
-            if len(values) == len(cloud.xyz):
+            if len(values) == len(found.xyz):
                 columns[key] = values
 
-        intensity = columns.get("intensity") if cloud.intensity is None else cloud.intensity
-        ring = ring_indices(columns.get("ring")) if cloud.ring is None else cloud.ring
-        return replace(cloud, intensity=intensity, ring=ring)
+        intensity = columns.get("intensity") if found.intensity is None else found.intensity
+        ring = cloud.ring_indices(columns.get("ring")) if found.ring is None else found.ring
+        return replace(found, intensity=intensity, ring=ring)
 
 
-def read_columns(path: Path, wanted: Names) -> Arrays:
+def read_columns(path: Path, wanted: cloud.Names) -> cloud.Arrays:
     """Read some columns of an array of points; columns without names are named "0", "1", ..."""
     return _columns_of(read_array(path), path, wanted)
 
 
-def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
+def _columns_of(array: np.ndarray, path: Path, wanted: cloud.Names) -> cloud.Arrays:
     numbers = range(min(array.shape[-1], MAX_COLUMNS))
     names = array.dtype.names or tuple(map(str, numbers))
 
     columns = {}
-    for key, index in require_columns(names, path, wanted).items():
+    for key, index in cloud.require_columns(names, path, wanted).items():
         columns[key] = array[..., index] if array.dtype.names is None else array[names[index]]
         if columns[key].dtype.kind not in "fiub" or columns[key].ndim > array.ndim:
             raise InputError(
@@ -111,7 +99,7 @@ def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
 
 def member_names(path: Path) -> list[str]:
     """Return the names of the arrays in an archive; raise InputError if it is no archive."""
-    with reading(path, "a NumPy archive", ARCHIVE_ADVICE), zipfile.ZipFile(path) as archive:
+    with cloud.reading(path, "a NumPy archive", ARCHIVE_ADVICE), zipfile.ZipFile(path) as archive:
         names = [name for name in archive.namelist() if name.endswith(".npy")]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
@@ -124,7 +112,7 @@ def member_names(path: Path) -> list[str]:
 
 def read_array(path: Path, key: str | None = None) -> np.ndarray:
     """Read an array of numbers from `.npy` or `.npz`; by default an archive's array of points."""
-    with reading(path, "NumPy arrays", ADVICE):
+    with cloud.reading(path, "NumPy arrays", ADVICE):
         if not zipfile.is_zipfile(path):
             with path.open("rb") as file:
                 return _load(file, path.stat().st_size, path)
@@ -172,22 +160,22 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
         )
 
     length = math.prod(shape) * dtype.itemsize
-    if not 0 <= length <= min(size, MAX_BYTES):
+    if not 0 <= length <= min(size, cloud.MAX_BYTES):
         raise InputError(
-            f"{path}: expected at most {min(size, MAX_BYTES)} bytes, found {length} for the shape "
-            f"{shape} of its array; {ADVICE}"
+            f"{path}: expected at most {min(size, cloud.MAX_BYTES)} bytes, found {length} for the "
+            f"shape {shape} of its array; {ADVICE}"
         )
     point_axes = shape[:1] if len(shape) < 3 else shape[:-1]
-    check_point_count(math.prod(point_axes), path)
+    cloud.check_point_count(math.prod(point_axes), path)
 
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)
 
 
-def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
+def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> cloud.Cloud:
     """Return the points of a table (N, C), a range image (H, W, C) or an array of records."""
     if array.dtype.names is not None:
-        return make_cloud(_columns_of(array.ravel(), path, COLUMN_NAMES), str(path))
+        return cloud.make_cloud(_columns_of(array.ravel(), path, cloud.COLUMN_NAMES), str(path))
     if array.ndim not in (2, 3) or array.shape[-1] < 3 or array.dtype.kind == "b":
         raise InputError(
             f"{path}: expected numbers of shape (N, 3), (N, 4), (N, 5) or (H, W, C), "
