@@ -33,8 +33,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import amvnet
 from amvnet.cli.main import DONE, main
-from amvnet.data.palette import class_colors
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Taxonomy, class_colors
 from amvnet.viewing.page import write_page
 from amvnet.viewing.shown_scans import ShownScan, shown_scan
 

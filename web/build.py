@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from amvnet.data.palette import DRAWN, UNLABELLED
+from amvnet.data.taxonomy import DRAWN_COLORS, UNLABELLED_COLOR
 from amvnet.engines.export.onnx import export
 from amvnet.files import temporary_folder
 from amvnet.viewing.page import drawing, fill_page
@@ -105,7 +105,7 @@ def pack(path: Path, to: Path) -> None:
 
 def viewer() -> str:
     """Return the viewer's page, which takes the scan from the page around it."""
-    colors = {"unlabelled": UNLABELLED, "drawn": DRAWN}
+    colors = {"unlabelled": UNLABELLED_COLOR, "drawn": DRAWN_COLORS}
     script = (SOURCE / "viewer_data.js").read_text(encoding="utf-8")
     return fill_page("Scan", drawing() | colors, replaced={"scans.js": script})
 

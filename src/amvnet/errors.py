@@ -37,6 +37,11 @@ def listed(items: Sequence[str], limit: int) -> str:
     return ", ".join(items[:limit]) + (f" and {more} more" if more > 0 else "")
 
 
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """Return a number of things in words, such as "2 scans"; irregular nouns give a `plural`."""
+    return f"{count} {noun}" if count == 1 else f"{count} {plural or f'{noun}s'}"
+
+
 def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") -> str:
     """Return the end of an error message: the most similar known name, or else the advice."""
     names = {name.lower(): name for name in known}

@@ -29,11 +29,6 @@ class Tenths:
         return True
 
 
-def counted(count: int, noun: str, plural: str = "") -> str:
-    """Return a number of things in words, such as "2 scans"; irregular nouns give a `plural`."""
-    return f"{count} {noun}" if count == 1 else f"{count} {plural or f'{noun}s'}"
-
-
 def no_progress(done: int, total: int) -> None:
     """Report nothing."""
 

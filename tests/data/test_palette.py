@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from amvnet.data.class_maps import BUILT_IN, class_map
-from amvnet.data.palette import DRAWN, UNCERTAIN, class_colors
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy
+from amvnet.data.taxonomy import (
+    DRAWN_COLORS,
+    NUSCENES,
+    SEMANTICKITTI,
+    TAXONOMIES,
+    UNCERTAIN_COLOR,
+    Taxonomy,
+    class_colors,
+)
 
 LEAST = 20.0  # distance of two colours in CIELAB from which they can be told apart
 DARK = 20  # lightness in CIELAB; darker colours cannot be seen on the dark page
@@ -34,7 +41,7 @@ def distance(first: tuple[int, int, int], second: tuple[int, int, int]) -> float
 )
 def test_the_classes_and_uncertain_points_can_be_told_apart(taxonomy: Taxonomy) -> None:
     colors = class_colors(taxonomy)[1:]
-    for first, second in combinations([*colors, UNCERTAIN], 2):
+    for first, second in combinations([*colors, UNCERTAIN_COLOR], 2):
         assert distance(first, second) >= LEAST
 
 
@@ -48,10 +55,12 @@ def test_a_traffic_sign_is_not_drawn_as_a_person() -> None:
 def test_only_colors_that_are_like_another_one_or_dark_are_replaced(name: str) -> None:
     taxonomy = TAXONOMIES[name]
     official = dict(zip(taxonomy.names, taxonomy.colors, strict=True))
-    assert set(DRAWN[name]) <= set(taxonomy.classes)
-    for replaced in DRAWN[name]:
+    assert set(DRAWN_COLORS[name]) <= set(taxonomy.classes)
+    for replaced in DRAWN_COLORS[name]:
         others = [color for other, color in official.items() if other != replaced]
-        distances = [distance(official[replaced], color) for color in [*others[1:], UNCERTAIN]]
+        distances = [
+            distance(official[replaced], color) for color in [*others[1:], UNCERTAIN_COLOR]
+        ]
         is_dark = to_lab(official[replaced])[0] < DARK
         assert min(distances) < LEAST or is_dark
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from amvnet.data.palette import class_colors
-from amvnet.data.taxonomy import SEMANTICKITTI, Color
+from amvnet.data.taxonomy import SEMANTICKITTI, Color, class_colors
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

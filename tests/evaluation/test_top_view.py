@@ -9,8 +9,7 @@ import pytest
 from matplotlib.image import imread
 from numpy.typing import ArrayLike
 
-from amvnet.data.palette import UNCERTAIN, WRONG
-from amvnet.data.taxonomy import NUSCENES
+from amvnet.data.taxonomy import NUSCENES, UNCERTAIN_COLOR, WRONG_COLOR
 from amvnet.evaluation.top_view import TopView, draw_scan
 
 from fixtures.marks import with_full
@@ -57,8 +56,8 @@ def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
         assert has_color(image, class_color(class_id))
 
     assert not has_color(image, class_color(7))
-    assert has_color(image, np.divide(WRONG, 255))
-    assert has_color(image, np.divide(UNCERTAIN, 255))
+    assert has_color(image, np.divide(WRONG_COLOR, 255))
+    assert has_color(image, np.divide(UNCERTAIN_COLOR, 255))
     assert [file.name for file in path.parent.iterdir()] == ["b.png"]
 
 
@@ -72,4 +71,4 @@ def test_points_that_are_lost_or_not_known_to_be_uncertain_are_left_out(
 
     view = TopView(points, NUSCENES, {"p": ids}, ids, "title", uncertain)
     image = imread(draw_scan(tmp_path / "a.png", view))
-    assert has_color(image, np.divide(UNCERTAIN, 255)) == with_uncertain
+    assert has_color(image, np.divide(UNCERTAIN_COLOR, 255)) == with_uncertain

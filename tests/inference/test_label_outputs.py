@@ -20,8 +20,7 @@ import pytest
 import amvnet
 from amvnet.data.formats.find import read_cloud
 from amvnet.data.labels.writers import KINDS, check_kind, write_scan_labels
-from amvnet.data.palette import class_colors
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, class_colors
 from amvnet.drives.world_map import check_ending
 
 from fixtures.commands import fails, files, refusal, run_cli

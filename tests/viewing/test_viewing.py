@@ -23,8 +23,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.labels.writers import write_scan_labels
-from amvnet.data.palette import WRONG, class_colors
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, WRONG_COLOR, class_colors
 from amvnet.errors import InputError
 from amvnet.evaluation.scoring import labels_by_method
 from amvnet.files import unfinished
@@ -587,7 +586,7 @@ def test_the_picture_shows_what_is_asked_for_at_its_place(tmp_path: Path, browse
 
     errors = browser.picture(path, f"{look}&color=error&hide=15")
     right_rows, right_columns = pixels_of(errors, CORRECT)
-    wrong_rows, _ = pixels_of(errors, WRONG)
+    wrong_rows, _ = pixels_of(errors, WRONG_COLOR)
     assert right_columns.max() < green_columns.min() + 3
     assert right_rows.max() < wrong_rows.min() + 3
     for color in (car, building):

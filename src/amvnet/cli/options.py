@@ -11,10 +11,9 @@ from amvnet.cli.console import report, silence
 from amvnet.cli.parser import flag_of
 from amvnet.config.bounds import Share
 from amvnet.engines.compute import Compute
-from amvnet.errors import InputError, listed
+from amvnet.errors import InputError, counted, listed
 from amvnet.files import FormatName
 from amvnet.models.methods import MethodName, widest_method
-from amvnet.progress import counted
 from amvnet.sensors.lidars import AUTO, UNKNOWN_SENSOR, Sensor
 
 if TYPE_CHECKING:

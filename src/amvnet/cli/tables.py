@@ -15,12 +15,11 @@ from rich.table import Table
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.check import Report
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import installation
+from amvnet.errors import counted, installation
 from amvnet.evaluation.metrics import OVERALL
 from amvnet.inference.journal import Entry
 from amvnet.inference.timing import MEAN, STAGES
 from amvnet.models.methods import title_of
-from amvnet.progress import counted
 from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.weights.file import built_in, load
 

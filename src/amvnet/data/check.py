@@ -14,8 +14,8 @@ from amvnet.data import plausible
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
-from amvnet.errors import InputError, listed
-from amvnet.progress import Progress, counted, no_progress
+from amvnet.errors import InputError, counted, listed
+from amvnet.progress import Progress, no_progress
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan
 

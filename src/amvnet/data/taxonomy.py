@@ -33,6 +33,25 @@ MAX_KNOWN = 40  # the same for known ids
 UNKNOWN = -1  # the mark of raw ids without a train id in lookup tables
 
 Color = tuple[int, int, int]  # RGB in 0..255
+UNLABELLED_COLOR: Color = (128, 136, 148)  # officially black
+WRONG_COLOR: Color = (255, 64, 54)
+UNCERTAIN_COLOR: Color = (255, 150, 180)  # no class of either benchmark has a similar colour
+
+# Colours that replace official colours, where these look like the colours of other classes in a
+# picture, or cannot be seen on a dark background.
+DRAWN_COLORS: dict[str, dict[str, Color]] = {
+    "semantickitti": {
+        "sidewalk": (150, 90, 150),
+        "other-ground": (75, 150, 90),
+        "traffic-sign": (135, 150, 0),
+    },
+    "nuscenes": {
+        "sidewalk": (150, 90, 150),
+        "motorcycle": (255, 30, 225),
+        "trailer": (0, 135, 255),
+        "truck": (225, 150, 255),
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -294,6 +313,15 @@ def user_taxonomy(
         splits={},
         counts_absent=False,
     )
+
+
+def class_colors(taxonomy: Taxonomy) -> tuple[Color, ...]:
+    """Return the K + 1 colours of the classes, RGB in 0..255, by train id."""
+    drawn = DRAWN_COLORS.get(taxonomy.name, {})
+    colors = [UNLABELLED_COLOR]
+    for name, color in zip(taxonomy.classes, taxonomy.colors[1:], strict=True):
+        colors.append(drawn.get(name, color))
+    return tuple(colors)
 
 
 def _rgb(values: Iterable[Any]) -> Color:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from amvnet.data.class_maps import class_map
 from amvnet.data.formats.registry import check_packages
-from amvnet.data.labels.clouds import Columns, write_cloud
+from amvnet.data.labels.writers import Columns, write_cloud
 from amvnet.data.poses import Poses
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.drives.consensus import (

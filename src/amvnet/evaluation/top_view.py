@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
-from amvnet.data.taxonomy import Color, Taxonomy
+from amvnet.data.taxonomy import UNCERTAIN_COLOR, WRONG_COLOR, Color, Taxonomy, class_colors
 from amvnet.files import Signature, atomic_write
 
 REACH = 50.0  # distance that is shown on each side of the sensor, metres
@@ -96,12 +95,12 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     second_row: list[_Panel | None] = [None]
     if view.uncertain is not None:
         total = len(view.uncertain)
-        second_row = [_highlight("uncertain", view.uncertain, total, UNCERTAIN)]
+        second_row = [_highlight("uncertain", view.uncertain, total, UNCERTAIN_COLOR)]
 
     for title, ids in view.predictions.items():
         wrong = (ids != view.truth) & labelled
         first_row.append(_Panel(title, palette[ids], ids > 0))
-        second_row.append(_highlight(f"errors of {title}", wrong, labelled.sum(), WRONG))
+        second_row.append(_highlight(f"errors of {title}", wrong, labelled.sum(), WRONG_COLOR))
     return [first_row, second_row]
 
 
@@ -122,9 +121,9 @@ def _legend_entries(view: TopView) -> list[tuple[str, Color]]:
     colors = class_colors(view.taxonomy)
     names = view.taxonomy.names
     entries = [(names[class_id], colors[class_id]) for class_id in class_ids if class_id > 0]
-    entries.append(("wrong", WRONG))
+    entries.append(("wrong", WRONG_COLOR))
     if view.uncertain is not None:
-        entries.append(("uncertain", UNCERTAIN))
+        entries.append(("uncertain", UNCERTAIN_COLOR))
     if 0 in class_ids:
         entries.append(("ignored", IGNORED))
     return entries

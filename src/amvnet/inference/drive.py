@@ -19,12 +19,12 @@ from amvnet.data.recordings import Recording, ScanFile, by_recording, evenly_spa
 from amvnet.drives.consensus import Consensus, DriveScan, Fused
 from amvnet.drives.odometry import GAP, PAIRS, Odometry, Pair, check_fit, check_steps
 from amvnet.drives.world_map import MapBuilder
-from amvnet.errors import InputError
+from amvnet.errors import InputError, counted
 from amvnet.files import digest
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
-from amvnet.progress import Progress, Reporter, counted, no_progress, report_nothing
+from amvnet.progress import Progress, Reporter, no_progress, report_nothing
 from amvnet.scan import AnyArray, Scan
 
 STANDING = -1.2  # height above which points of a normalised scan stand on the ground, metres

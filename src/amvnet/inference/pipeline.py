@@ -25,7 +25,7 @@ from amvnet.data.labels.writers import (
 )
 from amvnet.data.recordings import ScanFile, by_recording
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError, SomeBroken, memory_for
+from amvnet.errors import InputError, SomeBroken, counted, memory_for
 from amvnet.files import (
     Signature,
     alone_in,
@@ -40,7 +40,7 @@ from amvnet.inference.drive import Broken, Drives, Labelled, Outcome
 from amvnet.inference.journal import UNFINISHED, Entry, Journal, check_unchanged, read_journals
 from amvnet.inference.scan_stream import READ_AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
-from amvnet.progress import Progress, counted, no_progress
+from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED_SCANS
 

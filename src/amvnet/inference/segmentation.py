@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from amvnet.data.labels.writers import KINDS, SIGNATURES, write_scan_labels
-from amvnet.data.palette import class_colors
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Taxonomy, class_colors
 from amvnet.errors import InputError, did_you_mean
 from amvnet.files import check_outputs
 from amvnet.models.amvnet import Scores

@@ -11,13 +11,12 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import NetworkName, NetworkTraining
-from amvnet.errors import InputError
+from amvnet.errors import InputError, counted
 from amvnet.evaluation.metrics import confusion
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
-from amvnet.progress import counted
 from amvnet.sensors.expectation import Expectation
 from amvnet.training import losses
 from amvnet.training.checking import Checked

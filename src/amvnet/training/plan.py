@@ -30,10 +30,10 @@ from amvnet.data.datasets.training_data import (
     to_mix_in,
 )
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, describe_difference
-from amvnet.errors import InputError
+from amvnet.errors import InputError, counted
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
-from amvnet.progress import Reporter, counted, report_nothing
+from amvnet.progress import Reporter, report_nothing
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.normalise import Normaliser, normalised

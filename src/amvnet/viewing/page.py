@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
-from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
+from amvnet.data.taxonomy import SEMANTICKITTI, UNCERTAIN_COLOR, WRONG_COLOR, Taxonomy, class_colors
 from amvnet.evaluation.metrics import OVERALL, Evaluation
 from amvnet.files import Signature, atomic_write, check_outputs, unfinished
 from amvnet.inference.segmentation import Segmentation
@@ -43,7 +42,7 @@ RAMP_STOPS = 17  # the number of colours between which the page interpolates a r
 # Matplotlib's colour map for each ramp, and the part of the map that is used, in [0, 1].
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
 # The colours from no disagreement to full disagreement of the networks, RGB in 0..255.
-UNCERTAINTY_RAMP = (CORRECT, (122, 104, 132), (190, 124, 158), UNCERTAIN, (255, 205, 220))
+UNCERTAINTY_RAMP = (CORRECT, (122, 104, 132), (190, 124, 158), UNCERTAIN_COLOR, (255, 205, 220))
 # The order counts: later scripts use what earlier scripts define.
 SCRIPTS = (
     "scans.js",
@@ -295,7 +294,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
 def drawing() -> dict[str, Any]:
     """Return the colours that the page's scripts use for any scan, for the page's JSON."""
     return {
-        "marks": {"correct": CORRECT, "wrong": WRONG, "unscored": UNSCORED},
+        "marks": {"correct": CORRECT, "wrong": WRONG_COLOR, "unscored": UNSCORED},
         "ramps": {
             "uncertainty": UNCERTAINTY_RAMP,
             "height": _ramp(*RAMPS["height"]),

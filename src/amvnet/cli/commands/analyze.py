@@ -10,8 +10,7 @@ from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelledChoice, load_dataset, load_segmenter
 from amvnet.config.bounds import Range, Share
 from amvnet.engines.compute import Compute
-from amvnet.errors import InputError
-from amvnet.progress import counted
+from amvnet.errors import InputError, counted
 from amvnet.sensors.lidars import AUTO
 
 Neighbours = Annotated[int, Range(1, 1000)]

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, report, show
 from amvnet.cli.options import TrainingChoice
-from amvnet.errors import InputError, SomeBroken
-from amvnet.progress import counted
+from amvnet.errors import InputError, SomeBroken, counted
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset

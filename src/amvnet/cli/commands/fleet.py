@@ -6,8 +6,7 @@ from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
-from amvnet.errors import import_optional
-from amvnet.progress import counted
+from amvnet.errors import counted, import_optional
 from amvnet.sensors.lidars import AUTO
 
 

@@ -8,8 +8,7 @@ from typing import Literal
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import ScanChoice, ScoresChoice
 from amvnet.config.bounds import Share
-from amvnet.errors import InputError
-from amvnet.progress import counted
+from amvnet.errors import InputError, counted
 
 
 def fuse(

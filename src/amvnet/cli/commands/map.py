@@ -9,8 +9,7 @@ from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_segmenter, open_inputs
 from amvnet.config.bounds import Range
 from amvnet.engines.compute import Compute, resolved
-from amvnet.errors import InputError
-from amvnet.progress import counted
+from amvnet.errors import InputError, counted
 from amvnet.sensors.lidars import AUTO
 
 SHOWN_CLASSES = 4  # number of classes in the line about the map

@@ -10,8 +10,7 @@ from amvnet.cli import options
 from amvnet.cli.console import progress, report, show
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute, resolved
-from amvnet.errors import InputError
-from amvnet.progress import counted
+from amvnet.errors import InputError, counted
 from amvnet.sensors.lidars import AUTO
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 from amvnet.cli.console import progress, report
 from amvnet.cli.options import LabelledChoice, load_dataset, load_segmenter
 from amvnet.engines.compute import Compute
-from amvnet.progress import counted
+from amvnet.errors import counted
 from amvnet.sensors.lidars import AUTO
 
 

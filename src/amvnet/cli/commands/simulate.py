@@ -8,7 +8,7 @@ from typing import Annotated
 
 from amvnet.cli.console import progress, report
 from amvnet.config.bounds import Count, Range, Seed
-from amvnet.progress import counted
+from amvnet.errors import counted
 
 
 def simulate(

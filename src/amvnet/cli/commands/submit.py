@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, report
-from amvnet.errors import InputError
-from amvnet.progress import counted
+from amvnet.errors import InputError, counted
 
 
 def submit(

@@ -9,9 +9,8 @@ from amvnet.cli.console import progress, report
 from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter, map_to, open_inputs
 from amvnet.config.bounds import Count
 from amvnet.engines.compute import Compute
-from amvnet.errors import InputError
+from amvnet.errors import InputError, counted
 from amvnet.models.methods import widest_method
-from amvnet.progress import counted
 
 
 def view(

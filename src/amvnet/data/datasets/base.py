@@ -9,8 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from amvnet.data.recordings import DatasetFiles, Normalise, Recording, ScanFile
-from amvnet.errors import InputError
-from amvnet.progress import counted
+from amvnet.errors import InputError, counted
 
 Names = tuple[str, ...]  # names of sequences
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.formats.raw import NUSCENES_ENDING
-from amvnet.data.labels.clouds import read_legend
 from amvnet.data.labels.readers import read_scan_labels
-from amvnet.data.labels.writers import KINDS, write_scan_labels
+from amvnet.data.labels.writers import KINDS, read_legend, write_scan_labels
 from amvnet.data.recordings import Normalise, Recording, ScanFile, by_recording
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy, describe_difference
 from amvnet.errors import InputError

@@ -19,8 +19,7 @@ from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.poses import Poses, read_poses, times_of
 from amvnet.data.recordings import Normalise, Recording, ScanFile, by_recording
 from amvnet.data.taxonomy import Taxonomy, check_classes
-from amvnet.errors import InputError, did_you_mean, readable, reason_of, shown
-from amvnet.progress import counted
+from amvnet.errors import InputError, counted, did_you_mean, readable, reason_of, shown
 from amvnet.scan import Scan
 
 SCANS_PER_VAL = 10  # of so many scans with labels, the last one validates by default

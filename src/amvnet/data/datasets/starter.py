@@ -18,13 +18,12 @@ from amvnet.data.datasets.description import ENDINGS, REST, LabelPlace
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import scan_stem
 from amvnet.data.formats.find import list_scans
-from amvnet.data.labels.clouds import read_legend
 from amvnet.data.labels.readers import COLUMNS, read_raw_labels
+from amvnet.data.labels.writers import read_legend
 from amvnet.data.recordings import evenly_spaced
 from amvnet.data.taxonomy import INSTANCE_MASK
-from amvnet.errors import InputError
+from amvnet.errors import InputError, counted
 from amvnet.files import atomic_write
-from amvnet.progress import counted
 
 COUNTED_FILES = 20  # number of label files whose ids are counted
 MOST_CLASSES = 50  # largest number of ids that become classes
