@@ -36,8 +36,7 @@ def _random_scan(count: int, seed: int = 0) -> Scan:
     rng = np.random.default_rng(seed)
     xyz = rng.normal(0, (20, 20, 3), (count, 3))
     points = np.column_stack([xyz, rng.random(count)]).astype(np.float32)
-    labels = rng.integers(0, 20, count).astype(np.uint8)
-    return Scan(points, labels, rng.integers(0, LASERS, count))
+    return Scan(points, rng.integers(0, 20, count).astype(np.uint8), rng.integers(0, LASERS, count))
 
 
 @pytest.fixture(scope="session", autouse=True)

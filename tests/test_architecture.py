@@ -126,8 +126,7 @@ PATHS = r"`((?:src|tests|docs|benchmarks|data)/[\w./-]+)`"
 
 @pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
 def test_the_files_that_a_page_names_exist(page: str) -> None:
-    text = (ROOT / page).read_text()
-    paths = re.findall(PATHS, text)
+    paths = re.findall(PATHS, (ROOT / page).read_text())
     assert paths
     for path in paths:
         if "NAME" not in path:  # of what is to be added
@@ -143,6 +142,5 @@ def test_the_names_that_the_contributing_page_mentions_exist() -> None:
 
 
 def test_no_page_has_the_marks_of_a_conflict() -> None:
-    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
-    for page in pages:
+    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
         assert not re.search(r"(?m)^(<<<<<<<|>>>>>>>) ", page.read_text(encoding="utf-8")), page

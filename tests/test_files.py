@@ -64,13 +64,11 @@ def write(
 
 
 def some_cloud() -> Cloud:
-    xyz = np.arange(3.0 * COUNT).reshape(COUNT, 3)
-    return Cloud(xyz, np.zeros(COUNT))
+    return Cloud(np.arange(3.0 * COUNT).reshape(COUNT, 3), np.zeros(COUNT))
 
 
 def named(name: str, path: Path = Path("scan.bin")) -> ScanFile:
-    recording = Recording("source")
-    scan = ScanFile(name, recording, path, prediction=f"{name}.label", read=some_cloud)
+    scan = ScanFile(name, Recording("source"), path, prediction=f"{name}.label", read=some_cloud)
     return ScanFiles([scan], NUSCENES).records()[0]
 
 
@@ -163,8 +161,7 @@ def test_scans_among_the_outputs_are_not_changed(
         with suppress(InputError):
             check_output(scans, output)
             Pipeline(scans, label, output).run({})
-        after = {path: (path.lstat().st_ino, path.read_bytes()) for path in paths}
-        assert after == before
+        assert {path: (path.lstat().st_ino, path.read_bytes()) for path in paths} == before
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -290,8 +287,7 @@ def make_hostile(folder: Path) -> None:
     nuscenes = open_dataset(f"nuscenes:{folder / 'nuscenes'}")
     for record in nuscenes.records(nuscenes.sequences("all")):
         scan = nuscenes.read(record)
-        ids = np.ones(len(scan), np.uint8)
-        nuscenes.write_labels(record, folder / "predictions", scan, ids)
+        nuscenes.write_labels(record, folder / "predictions", scan, np.ones(len(scan), np.uint8))
     (folder / "temporary").mkdir()
 
 
@@ -380,8 +376,7 @@ def test_content_is_on_disk_before_a_name(monkeypatch: pytest.MonkeyPatch, tmp_p
         part.write_text("a")
 
     inode = (tmp_path / "a.txt").stat().st_ino
-    folder = tmp_path.stat().st_ino
-    assert calls == [("fsync", inode), ("replace", inode), ("fsync", folder)]
+    assert calls == [("fsync", inode), ("replace", inode), ("fsync", tmp_path.stat().st_ino)]
 
 
 def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:

@@ -124,8 +124,7 @@ def test_files_of_one_kind_are_replaced_if_told(name: str, world: Path, tmp_path
 
 @pytest.mark.parametrize("name", with_full(sorted(set(CASES) - {"bench", "table"}), SLOW + ALIKE))
 def test_a_command_repeats_itself_only_if_told_to(name: str, world: Path, tmp_path: Path) -> None:
-    case = CASES[name]
-    command = case.text(world, tmp_path)
+    command = CASES[name].text(world, tmp_path)
     succeed(command)
     written = contents(tmp_path)
     refused(command, "--overwrite")

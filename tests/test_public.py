@@ -55,8 +55,7 @@ def test_dir_shows_what_is_public_and_nothing_else() -> None:
 
 def test_help_shows_what_is_public_and_nothing_else() -> None:
     text = pydoc.plain(pydoc.render_doc(amvnet))
-    names = re.findall(r"^    (?:class )?(\w+)\(.*\)", text, re.M)
-    assert set(names) == set(amvnet.__all__)
+    assert set(re.findall(r"^    (?:class )?(\w+)\(.*\)", text, re.M)) == set(amvnet.__all__)
     assert "import_module" not in text
     assert "TYPE_CHECKING" not in text
 
@@ -78,8 +77,7 @@ def test_read_gives_the_scan_of_a_file_as_it_is(tmp_path: Path) -> None:
     POINTS.tofile(tmp_path / "a.bin")
     write_pcd(tmp_path / "b.pcd", POINTS, "binary")
     for name in ("a.bin", "b.pcd"):
-        scan = amvnet.read(tmp_path / name)
-        np.testing.assert_array_equal(scan.points, POINTS)
+        np.testing.assert_array_equal(amvnet.read(tmp_path / name).points, POINTS)
     assert isinstance(amvnet.read(str(tmp_path / "a.bin")), Scan)
 
 
@@ -154,8 +152,7 @@ def test_a_scan_of_a_dataset_keeps_its_labels(tmp_path: Path, segmenter: Segment
 def test_names_colours_and_raw_ids_are_aligned_with_ids(result: Segmentation) -> None:
     assert result.class_names == ("unlabelled", *SEMANTICKITTI.classes)
     assert result.colors.shape == (20, 3)
-    car = result.class_names.index("car")
-    assert result.colors[car].tolist() == [100, 150, 245]
+    assert result.colors[result.class_names.index("car")].tolist() == [100, 150, 245]
 
     expected = np.asarray(SEMANTICKITTI.train_to_raw)[result.labels]
     np.testing.assert_array_equal(result.raw_ids, expected)
@@ -215,8 +212,7 @@ def test_a_scan_is_never_replaced_by_its_labels(tmp_path: Path, segmenter: Segme
 def test_labels_replace_earlier_labels_alone(result: Segmentation, tmp_path: Path) -> None:
     for kind in KINDS:
         path = result.save(tmp_path / f"a.{kind}")
-        before = path.read_bytes()
-        assert result.save(path).read_bytes() == before
+        assert result.save(path).read_bytes() == path.read_bytes()
         path.write_bytes(b"PK something else")
         fails(partial(result.save, path), path, "found another file")
         assert path.read_bytes() == b"PK something else"
@@ -233,8 +229,7 @@ def test_show_writes_a_page_and_opens_it(
 
     path = amvnet.show(result, tmp_path / "p.html")
     assert opened == [path.as_uri()]
-    page = read_page(path)
-    _, planes = page.scan(0)
+    _, planes = read_page(path).scan(0)
     is_valid = np.arange(len(points)) != 7
     np.testing.assert_array_equal(planes["amvnet"], result.labels[is_valid])
     np.testing.assert_array_equal(planes["truth"], SEMANTICKITTI.to_train(raw)[is_valid])

@@ -294,8 +294,7 @@ def test_the_table_of_extras_fits_into_80_columns(monkeypatch: pytest.MonkeyPatc
     console = Console(width=80)
     with console.capture() as capture:
         console.print(tables.extras_table())
-    rows = capture.get().splitlines()[3:]
-    assert [row.split()[0] for row in rows] == list(tables.EXTRAS)
+    assert [row.split()[0] for row in capture.get().splitlines()[3:]] == list(tables.EXTRAS)
 
 
 # ---- bench
@@ -312,8 +311,7 @@ def test_bench_times_every_stage(world: Path, capsys: pytest.CaptureFixture[str]
 def test_bench_figures_add_up(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock that goes on by a millisecond whenever it is read."""
     ticks = itertools.count()
-    clock = SimpleNamespace(perf_counter=lambda: next(ticks) / 1000)
-    monkeypatch.setattr(timing, "time", clock)
+    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: next(ticks) / 1000))
     options = f"--scan {world}/lone.bin --runs 3 --json {tmp_path}/b.json"
     succeed(f"bench --weights {world}/w.safetensors {options}")
     figures = read_json(tmp_path / "b.json")

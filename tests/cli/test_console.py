@@ -109,10 +109,9 @@ def test_long_texts_are_shortened(capsys: pytest.CaptureFixture[str]) -> None:
 
 def amvnet(shell: str, **environment: str) -> tuple[int, str, str]:
     """Run a line of bash in which $AMVNET is the command; return its exit code and output."""
-    command = {"AMVNET": f"{sys.executable} -m amvnet", **environment}
     done = subprocess.run(
         ["bash", "-c", shell],
-        env=os.environ | command,
+        env=os.environ | {"AMVNET": f"{sys.executable} -m amvnet", **environment},
         capture_output=True,
         text=True,
         timeout=PATIENCE,

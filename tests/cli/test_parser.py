@@ -181,8 +181,7 @@ def test_fields_of_a_dataclass_are_options_and_reach_the_command_in_it() -> None
         calls.append((count, choice))
 
     parser = make_parser("command", command)
-    values = parser.values(["--count", "3", "--split", "val", "--topic", "/a"])
-    run_with(command, values)
+    run_with(command, parser.values(["--count", "3", "--split", "val", "--topic", "/a"]))
     assert calls == [(3, ScanChoice(split="val", topic="/a"))]
 
     help_text = " ".join(parser.format_help().split())

@@ -94,8 +94,7 @@ def test_odometry_is_interpolated_and_moved_to_the_lidar(tmp_path: Path, storage
     fixed = transform(FIRST, np.linalg.inv(ON_WHEELS), ("base_link", "wheels"))
     bag = write_bag(tmp_path / "drive", [*STATICS, fixed, *sent, *CLOUDS], storage)
     lines: list[str] = []
-    found = poses_of(bag, "/odom", lines)
-    for pose, time in zip(found, TIMES, strict=True):
+    for pose, time in zip(poses_of(bag, "/odom", lines), TIMES, strict=True):
         expected = between(times, poses, time) @ ON_WHEELS @ ON_BASE @ ON_MOUNT
         np.testing.assert_allclose(pose, expected, atol=1e-4)  # times are rounded to nanoseconds
     assert not lines
@@ -178,8 +177,7 @@ def in_circle() -> list[Sent]:
 
 
 def of_another_epoch() -> list[Sent]:
-    sent = drive_odometry(SCANS)
-    return [odometry(one.time + 1.7e9, pose_at(one.time)) for one in sent]
+    return [odometry(one.time + 1.7e9, pose_at(one.time)) for one in drive_odometry(SCANS)]
 
 
 def of_two_frames() -> list[Sent]:

@@ -64,8 +64,7 @@ def columns_bomb(path: Path) -> None:
 
 
 def records_bomb(path: Path) -> None:
-    padded = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("", "|V100000000")]
-    write_npz(path, padded, (40,), 4000)
+    write_npz(path, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("", "|V100000000")], (40,), 4000)
 
 
 def gzip_bomb(path: Path) -> None:

@@ -203,8 +203,7 @@ def test_labels_that_change_are_read_again(data: Path) -> None:
 def counts_of(data: Path) -> np.ndarray:
     """Return the (K,) points of each class in all splits, as `check` finds them."""
     dataset = open_dataset(str(data))
-    records = dataset.records(dataset.sequences("all"))
-    report = check_scans(dataset, {"train": records})
+    report = check_scans(dataset, {"train": dataset.records(dataset.sequences("all"))})
     return report.splits["train"].points[1:]
 
 
@@ -299,8 +298,7 @@ def test_a_class_that_is_spread_like_random_points_is_reported(data: Path) -> No
         chosen = np.random.default_rng(len(points)).random(len(raw)) < 0.025
         return points, np.where(chosen, 8, raw)
 
-    classes = {"ground": 3, "wall": 7, "bush": 8, "car": 11}
-    line, *_ = warnings_of(data, sprinkle, classes=classes)
+    line, *_ = warnings_of(data, sprinkle, classes={"ground": 3, "wall": 7, "bush": 8, "car": 11})
     assert line.startswith("train: points spread like random ones: bush;")
 
 

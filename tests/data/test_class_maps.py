@@ -244,10 +244,7 @@ def test_labels_that_predict_wrote_with_a_map_are_scored_with_the_same_map_alone
     succeed("predict", data, "--weights", weights, "--classes", few, "--out", out)
     reports = []
     for labels in (("--weights", weights), ("--predictions", out)):
-        succeed(
-            *("evaluate", data, *labels, "--classes", few),
-            *("--json", figures, "--overwrite"),
-        )
+        succeed(*("evaluate", data, *labels, "--classes", few), *("--json", figures, "--overwrite"))
         reports.append(json.loads(figures.read_text())["methods"])
     assert reports[0]["amvnet"] == reports[1]["predictions"]
     for options in ([], ["--classes", "coarse"]):

@@ -203,8 +203,7 @@ def test_semantickitti_without_labels_has_none(tmp_path: Path) -> None:
 
 def test_semantickitti_opens_at_the_sequences_folder(tmp_path: Path) -> None:
     make_semantickitti(tmp_path)
-    dataset = open_dataset(str(tmp_path / "sequences"))
-    first, second = dataset.records(["08"])
+    first, second = open_dataset(str(tmp_path / "sequences")).records(["08"])
     assert (first.name, second.name) == ("08/000000", "08/000001")
 
 
@@ -389,5 +388,4 @@ def test_without_the_official_split_the_last_sequence_validates_and_tests_are_le
 def test_a_lone_sequence_is_not_split(tmp_path: Path) -> None:
     dataset = open_dataset(str(make_streets(tmp_path, ("00", "11"), 1)))
     fails(lambda: to_train(dataset), "two sequences", "00 alone", "YAML")
-    scans = to_train(dataset, with_val=True)
-    assert [record.sequence for record in scans.train] == ["00"]
+    assert [record.sequence for record in to_train(dataset, with_val=True).train] == ["00"]

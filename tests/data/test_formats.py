@@ -81,8 +81,7 @@ def test_the_content_counts_if_the_name_is_wrong(
 ) -> None:
     path = tmp_path / disguise
     path.write_bytes((folder / name).read_bytes())
-    scan = read_scan(path)
-    np.testing.assert_allclose(scan.points, some_points(), rtol=0, atol=LAS_STEP)
+    np.testing.assert_allclose(read_scan(path).points, some_points(), rtol=0, atol=LAS_STEP)
 
 
 def test_a_folder_lists_all_of_them(folder: Path) -> None:
@@ -383,8 +382,7 @@ def test_messages_with_gaps_and_either_byte_order_are_read(padded: bool, big: bo
     [{"width": 61}, {"width": 2**32 - 1, "row_step": 0}, {"row_step": 10}, {"fields": []}],
 )
 def test_a_message_that_claims_more_than_it_has_is_refused(changes: dict[str, Any]) -> None:
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    message = cloud_message(store, some_points(), **changes)
+    message = cloud_message(get_typestore(Stores.ROS2_HUMBLE), some_points(), **changes)
     fails(lambda: read_message(message, "here"), "here")
 
 

@@ -104,8 +104,7 @@ def test_a_broken_file_gives_a_scan_or_an_error_of_one_line(
         random=st.none() | st.binary(max_size=300),
     )
     def check_broken_file(changes: list[Change], share: float, random: bytes | None) -> None:
-        broken = change(contents[name], changes, share) if random is None else random
-        file.write_bytes(broken)
+        file.write_bytes(change(contents[name], changes, share) if random is None else random)
 
         message = error_of(scan_path)
         assert "\n" not in message

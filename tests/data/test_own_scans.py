@@ -112,8 +112,7 @@ def test_scans_without_a_label_file_are_left_out_of_the_training(tmp_path: Path)
         RAW.astype(np.uint32).tofile(tmp_path / f"{labelled}.label")
 
     data = open_own(describe(tmp_path))
-    unlabelled = data.read(data.records(["a"])[1])
-    assert unlabelled.labels is None
+    assert data.read(data.records(["a"])[1]).labels is None
     scans = to_train(data)
     assert [record.name for record in scans.train] == ["a/0"]
     assert [record.name for record in scans.val] == ["b/1"]
@@ -201,18 +200,15 @@ def test_an_entry_of_the_split_without_scans_is_refused(
 def test_a_split_without_val_is_not_replaced_by_the_default(tmp_path: Path) -> None:
     data = sites(tmp_path, {"train": ["a", "b"]})
     fails(lambda: to_train(data), "split val", "only train")
-    scans = to_train(data, None, ["c"])
-    assert {record.sequence for record in scans.train} == {"a", "b"}
-    everything = to_train(data, with_val=True)
-    assert {record.sequence for record in everything.train} == {"a", "b"}
+    assert {record.sequence for record in to_train(data, None, ["c"]).train} == {"a", "b"}
+    assert {record.sequence for record in to_train(data, with_val=True).train} == {"a", "b"}
 
 
 def test_test_scans_are_never_trained_on(tmp_path: Path) -> None:
     data = sites(tmp_path, {"val": "c", "test": "b"})
     fails(lambda: to_train(data, ["a", "b"], None), "test split", "found b")
     for with_val in (False, True):
-        scans = to_train(data, with_val=with_val)
-        assert "b" not in {record.sequence for record in scans.train}
+        assert "b" not in {record.sequence for record in to_train(data, with_val=with_val).train}
     assert "b" not in {record.sequence for record in to_mix_in(data).train}
 
 
@@ -222,8 +218,7 @@ def test_the_default_split_validates_with_the_last_sequence_that_has_labels(tmp_
 
 def test_named_sequences_are_not_used_for_the_other_purpose(tmp_path: Path) -> None:
     data = sites(tmp_path)
-    scans = to_train(data, None, ["a"])
-    assert {record.sequence for record in scans.train} == {"b", "c", "d"}
+    assert {record.sequence for record in to_train(data, None, ["a"]).train} == {"b", "c", "d"}
     fails(lambda: to_train(data, ["d"], None), "two sequences", "name them")
 
 
@@ -240,8 +235,7 @@ def test_evaluate_scores_the_val_scans(tmp_path: Path, capsys: pytest.CaptureFix
 
 @pytest.mark.parametrize("ignored", ["rest", ["rest"], [40, "rest"]])
 def test_the_rest_of_the_ids_can_be_ignored(site: Path, ignored: Any) -> None:
-    raw = np.where(RAW == 40, np.arange(60) + 1000, RAW)
-    raw.astype(np.uint32).tofile(site / "a.label")
+    np.where(RAW == 40, np.arange(60) + 1000, RAW).astype(np.uint32).tofile(site / "a.label")
     np.testing.assert_array_equal(only_scan(site.parent, ignored=ignored), EXPECTED)
 
     # Weights, which carry the classes, do not name 65,536 ids.
@@ -429,8 +423,7 @@ def test_dots_after_a_link_lead_to_the_folder_above_its_target(tmp_path: Path) -
     np.save(tmp_path / "disk/points/a.npy", some_points())
     RAW.astype(np.uint32).tofile(tmp_path / "disk/labels/a.label")
     (tmp_path / "site").symlink_to(tmp_path / "disk/points")
-    labels = only_scan(tmp_path, labels="../labels/{name}.label")
-    np.testing.assert_array_equal(labels, EXPECTED)
+    np.testing.assert_array_equal(only_scan(tmp_path, labels="../labels/{name}.label"), EXPECTED)
 
 
 def test_a_column_of_labels_is_named_by_its_number(site: Path) -> None:
@@ -452,8 +445,7 @@ def test_nan_is_no_label(site: Path) -> None:
 def test_labels_that_are_true_or_false_are_1_and_0(site: Path) -> None:
     is_car = np.arange(60) % 2 == 0
     np.save(site / "a.labels.npy", is_car)
-    classes = {"other": 0, "car": 1}
-    changes = {"labels": ".labels.npy", "classes": classes, "ignored": [9]}
+    changes = {"labels": ".labels.npy", "classes": {"other": 0, "car": 1}, "ignored": [9]}
     np.testing.assert_array_equal(only_scan(site.parent, **changes), 2 - is_car)
     np.save(site / "a.npy", some_points() > 0)  # no points
     fails(lambda: only_scan(site.parent, **changes), "bool")

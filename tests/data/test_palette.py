@@ -40,8 +40,7 @@ def distance(first: tuple[int, int, int], second: tuple[int, int, int]) -> float
     "taxonomy", [SEMANTICKITTI, NUSCENES, *(class_map(name).target for name in BUILT_IN)]
 )
 def test_the_classes_and_uncertain_points_can_be_told_apart(taxonomy: Taxonomy) -> None:
-    colors = class_colors(taxonomy)[1:]
-    for first, second in combinations([*colors, UNCERTAIN_COLOR], 2):
+    for first, second in combinations([*class_colors(taxonomy)[1:], UNCERTAIN_COLOR], 2):
         assert distance(first, second) >= LEAST
 
 

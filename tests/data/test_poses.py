@@ -65,8 +65,7 @@ def test_every_format_gives_the_same_poses(tmp_path: Path, write: Callable[[Path
 )
 def test_a_bom_commas_and_names_change_nothing(tmp_path: Path, spoil: Callable[[str], str]) -> None:
     path = write_tum(tmp_path / "tum.txt")
-    lines = path.read_text().splitlines()[1:]
-    path.write_text(spoil("\n".join(lines)), encoding="utf-8")
+    path.write_text(spoil("\n".join(path.read_text().splitlines()[1:])), encoding="utf-8")
     np.testing.assert_allclose(read_poses(path).poses, POSES, atol=1e-9)
 
 
@@ -167,8 +166,7 @@ def test_wrong_pose_tables_are_one_line(tmp_path: Path, table: str, key: str, va
 
 
 def test_poses_are_interpolated_at_the_times_of_the_scans(tmp_path: Path) -> None:
-    file = read_poses(write_tum(tmp_path / "tum.txt"))
-    halfway = file.at([100.05, 100.35], 2)
+    halfway = read_poses(write_tum(tmp_path / "tum.txt")).at([100.05, 100.35], 2)
     for pose, before in zip(halfway, (0, 3), strict=True):
         middle = (POSES[before, :3, 3] + POSES[before + 1, :3, 3]) / 2
         np.testing.assert_allclose(pose[:3, 3], middle, atol=1e-9)
@@ -202,8 +200,7 @@ def test_times_in_other_units_are_called_so(tmp_path: Path, scans: str, poses: s
     file = read_poses(write_tum(tmp_path / "tum.txt", first=first))
     assert file.times is not None
     file = replace(file, times=file.times * 10 ** powers[poses])
-    names = [str((first + second) * 10 ** powers[scans]) for second in (1, 2)]
-    times = times_of(names)
+    times = times_of([str((first + second) * 10 ** powers[scans]) for second in (1, 2)])
     if (poses, scans) in (("s", "s"), ("s", "ns"), ("ms", "ms")):
         assert len(file.at(times, 2)) == 2
     else:

@@ -37,8 +37,7 @@ def process_id() -> int:
 
 
 def test_one_process_serves_all_files_and_threads(bag: Path, tmp_path: Path) -> None:
-    path = write_las(tmp_path / "a.las", some_points())
-    read_scan(path)
+    read_scan(write_las(tmp_path / "a.las", some_points()))
     first = process_id()
     scans = list(list_scans(bag))
     with ThreadPoolExecutor(8) as threads:

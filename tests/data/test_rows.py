@@ -26,8 +26,7 @@ TIME = 1.6e9  # seconds, of the first point
 def table() -> np.ndarray:
     """(N, 6) x, y, z, intensity, ring and time of a scan."""
     points, ring = place(LASERS["vlp16"], 0.9)
-    time = TIME + np.linspace(0, 0.1, len(points))
-    return np.column_stack([points, ring, time])
+    return np.column_stack([points, ring, TIME + np.linspace(0, 0.1, len(points))])
 
 
 def row_bytes(table: np.ndarray, dtype: str = "float32") -> bytes:
@@ -100,8 +99,7 @@ def test_lost_returns_may_have_any_value_that_is_no_place(
     rows[3::6, 3] = value
     cloud = read_cloud(write_rows(tmp_path, rows))
     np.testing.assert_array_equal(cloud.xyz, rows[:, :3])
-    scan = cloud.to_scan()
-    assert scan.valid.tolist() == [index % 3 > 0 for index in range(len(rows))]
+    assert cloud.to_scan().valid.tolist() == [index % 3 > 0 for index in range(len(rows))]
 
 
 @pytest.mark.parametrize("columns", [4, 5])
@@ -367,8 +365,7 @@ def test_patterns_of_any_folders_follow_links_once(table: np.ndarray, tmp_path: 
     path = drives / "own.yaml"
     path.write_text('classes: {a: 1}\nscans: "**/*.bin"\n')
     data = open_dataset(str(path))
-    records = data.records(data.sequences("all"))
-    assert [record.path for record in records] == expected
+    assert [record.path for record in data.records(data.sequences("all"))] == expected
 
 
 @pytest.mark.parametrize("has_circles", [False, True])
@@ -424,8 +421,7 @@ def test_colours_after_the_intensity_are_no_rings() -> None:
 
 
 def test_equally_frequent_labels_with_gaps_are_no_rings() -> None:
-    rng = np.random.default_rng(0)
-    xyz = rng.normal(0, 10, (2600, 3))
+    xyz = np.random.default_rng(0).normal(0, 10, (2600, 3))
     labels = np.arange(2600) % 26
     assert are_rings(xyz, labels)
     assert not are_rings(xyz, labels * 9)

@@ -84,8 +84,7 @@ def test_raw_and_train_ids_are_inverse(taxonomy: Taxonomy) -> None:
     raw = taxonomy.to_raw(ids)
     assert raw.dtype == np.uint32
     assert taxonomy.to_train(raw).tolist() == ids.tolist()
-    with_instances = raw | np.uint32(7 << 16)
-    assert taxonomy.to_train(with_instances).tolist() == ids.tolist()
+    assert taxonomy.to_train(raw | np.uint32(7 << 16)).tolist() == ids.tolist()
     assert len(taxonomy.colors) == taxonomy.size + 1
 
     fails(lambda: taxonomy.to_train(np.array([400], dtype=np.uint32)), "400", taxonomy.name)

@@ -62,8 +62,7 @@ def test_a_scan_equals_that_of_the_files_of_a_simulation(
 
     dataset = pickle.loads(pickle.dumps(SimulatedStreets(tmp_path / "cache", sensor)))
     expected = written.records(written.sequences("all"))
-    records = dataset.records(["12"])
-    for record, written_record in zip(records, expected, strict=True):
+    for record, written_record in zip(dataset.records(["12"]), expected, strict=True):
         scan = dataset.read(record)
         other = written.read(written_record)
         assert np.array_equal(scan.points, other.points)
@@ -118,8 +117,7 @@ def test_the_splits_are_different_streets(sensor: str, tmp_path: Path) -> None:
 
 
 def test_any_number_is_a_street(tmp_path: Path) -> None:
-    dataset = SimulatedStreets(tmp_path)
-    records = dataset.records(["31", "000007", "7"])
+    records = SimulatedStreets(tmp_path).records(["31", "000007", "7"])
     assert [record.sequence for record in records] == ["000007"] * 6 + ["000031"] * 6
     assert [record.name for record in records[5:7]] == ["000007/000005", "000031/000000"]
 
@@ -133,8 +131,7 @@ def test_anything_but_a_number_is_no_street(name: str, tmp_path: Path) -> None:
 def test_a_street_depends_on_its_number_alone(tmp_path: Path) -> None:
     first = SimulatedStreets(tmp_path / "a")
     second = SimulatedStreets(tmp_path / "b")
-    records = first.records(["3", "4"])
-    points = {record.name: first.read(record).points for record in records}
+    points = {record.name: first.read(record).points for record in first.records(["3", "4"])}
     for record in reversed(second.records(["3", "4"])):
         assert np.array_equal(second.read(record).points, points[record.name])
     assert not np.array_equal(points["000003/000000"], points["000004/000000"])
@@ -198,8 +195,7 @@ def test_streets_read_long_ago_make_room(tmp_path: Path, monkeypatch: pytest.Mon
         os.utime(record.path.parent, (long_ago, long_ago))
     dataset.read(records[0])  # now the latest
 
-    files = records[0].path.parent.rglob("*.npy")
-    size = sum(path.stat().st_size for path in files)
+    size = sum(path.stat().st_size for path in records[0].path.parent.rglob("*.npy"))
     monkeypatch.setattr(simulated, "CACHE_BYTES", int(3.5 * size))
     dataset.read(records[4])
     assert streets(tmp_path) == ["000000", "000003", "000004"]
@@ -269,8 +265,7 @@ def test_any_number_of_workers_gives_the_same_fresh_streets(workers: int, tmp_pa
 
 
 def test_validation_has_the_same_streets_in_every_epoch(tmp_path: Path) -> None:
-    dataset = SimulatedStreets(tmp_path)
-    scans = ScanSet(data_of(dataset, "7"), Expectation())
+    scans = ScanSet(data_of(SimulatedStreets(tmp_path), "7"), Expectation())
     assert scans[4, 2].name == scans[0, 2].name == "000007/000002"
 
 

@@ -76,8 +76,7 @@ def test_scans_and_labels_are_told_apart_whatever_their_names(
     path, found = write_starter(make_flat(tmp_path / "data", 3, scans, labels))
     assert found.scans == [tmp_path / "data" / scans.format(index) for index in range(3)]
     started = open_own(path)
-    records = started.records(started.parts()["all"])
-    paths = sorted(str(record.labels_path) for record in records)
+    paths = sorted(str(record.labels_path) for record in started.records(started.parts()["all"]))
     assert paths == [str(tmp_path / "data" / labels.format(index)) for index in range(3)]
 
 
@@ -90,8 +89,7 @@ def test_labels_in_a_folder_beside_the_scans_are_found(tmp_path: Path) -> None:
         path, found = write_starter(data / "scans")
         assert found.labelled == 3
         started = open_own(path)
-        records = started.records(started.parts()["all"])
-        assert [record.labels_path for record in records] == [
+        assert [record.labels_path for record in started.records(started.parts()["all"])] == [
             data / "labels" / below / f"{index:04d}.npy" for index in range(3)
         ]
 
@@ -142,8 +140,7 @@ def test_check_of_a_folder_writes_the_file_once_and_says_what_to_fill_in(
 
 
 def test_scans_without_labels_get_a_file_that_says_so(tmp_path: Path) -> None:
-    folder = make_flat(tmp_path / "data", 2, "{:04d}.pcd")
-    path, found = write_starter(folder)
+    path, found = write_starter(make_flat(tmp_path / "data", 2, "{:04d}.pcd"))
     assert found.labels is None
     assert "no file with a label for each point" in list(found.lines())[1]
     assert not path.read_text().count("class_")
@@ -159,16 +156,14 @@ def test_a_folder_without_scans_gets_no_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["my data", "a:b", "-dash", "[x]", "ü ✓", "a#b", "{name}", "'\""])
 def test_a_folder_may_have_any_name(tmp_path: Path, name: str) -> None:
-    folder = make_flat(tmp_path / name, 3, "{:04d}.pcd", "{:04d}.npy")
-    line = refusal("check", folder)
+    line = refusal("check", make_flat(tmp_path / name, 3, "{:04d}.pcd", "{:04d}.npy"))
     command = shlex.split(line[line.index("amvnet check") :])
     succeed(*command[1:])
 
 
 @pytest.mark.parametrize("name", ["a\nb", os.fsdecode(b"a\xff")])
 def test_a_name_that_no_yaml_file_holds_is_refused(tmp_path: Path, name: str) -> None:
-    folder = make_flat(tmp_path / name, 3, "{:04d}.pcd")
-    refused(("check", folder), "printable", "rename")
+    refused(("check", make_flat(tmp_path / name, 3, "{:04d}.pcd")), "printable", "rename")
     assert files(tmp_path) == {f"{name}/{index:04d}.pcd" for index in range(3)}
 
 

@@ -39,8 +39,7 @@ def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_the_site_has_the_help_of_every_command() -> None:
     hook = load_script("docs/command_line.py")
     written = (DOCS / hook.PAGE).read_text(encoding="utf-8")
-    page = SimpleNamespace(file=SimpleNamespace(src_uri=hook.PAGE))
-    built = hook.on_page_markdown(written, page)
+    built = hook.on_page_markdown(written, SimpleNamespace(file=SimpleNamespace(src_uri=hook.PAGE)))
 
     assert re.findall(r"## amvnet (\w+)", built) == list(COMMANDS)
     for command in COMMANDS:

@@ -24,5 +24,4 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(list(Path("drive_labels").rglob("*.label"))) == 3
     assert Path("map.html").stat().st_size
 
-    variables = execute(PAGE.blocks("python"))
-    assert "uncertain" in repr(variables["result"])
+    assert "uncertain" in repr(execute(PAGE.blocks("python"))["result"])

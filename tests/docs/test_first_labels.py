@@ -20,5 +20,4 @@ def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert Path("city.html").stat().st_size
     assert Path("coloured/000000.ply").stat().st_size
 
-    variables = execute(PAGE.blocks("python"))
-    assert "uncertain" in repr(variables["result"])
+    assert "uncertain" in repr(execute(PAGE.blocks("python"))["result"])

@@ -127,5 +127,4 @@ def test_the_share_that_is_warned_about_is_that_of_the_weights() -> None:
 
 def test_the_names_of_sensors_are_those_that_are_known() -> None:
     pattern = r"(?s)which states the lasers and the field of view: (.*?)\.\s"
-    names = re.findall(pattern, SENSOR.text)[0]
-    assert re.findall(r"`([\w-]+)`", names) == list(KNOWN_SENSORS)
+    assert re.findall(r"`([\w-]+)`", re.findall(pattern, SENSOR.text)[0]) == list(KNOWN_SENSORS)

@@ -56,8 +56,7 @@ def test_the_page_on_the_installation_has_the_extras_of_the_makefile_and_its_lin
 
 
 def test_the_first_screen_of_the_readme_needs_no_word_of_the_method() -> None:
-    readme = (ROOT / "README.md").read_text()
-    screen = "\n".join(readme.splitlines()[:60])
+    screen = "\n".join((ROOT / "README.md").read_text().splitlines()[:60])
     words = r"RV|BEV|ensembles?|range|bird|heads?|tau|fus\w+|projections?|mIoU|IoU|\d{4}-\d\d"
     assert re.findall(rf"\b({words})\b", screen) == []
     for command in (

@@ -54,8 +54,7 @@ def legend_of(name: str) -> list[tuple[int, int]]:
 
 
 @pytest.mark.parametrize(
-    ("name", "difference"),
-    [("page.png", 0), ("figures/map.png", 0), ("figures/viewer.webp", LOSS)],
+    ("name", "difference"), [("page.png", 0), ("figures/map.png", 0), ("figures/viewer.webp", LOSS)]
 )
 def test_a_legend_in_the_viewer_has_the_colours_of_the_classes(name: str, difference: int) -> None:
     legend = legend_of(name)
@@ -66,8 +65,7 @@ def test_a_legend_in_the_viewer_has_the_colours_of_the_classes(name: str, differ
 
 
 def test_the_legend_of_the_hard_scan_has_the_colours_of_the_classes() -> None:
-    picture = pixels("figures/hard_scan.png")
-    legend = picture[SHEET:]
+    legend = pixels("figures/hard_scan.png")[SHEET:]
     counts: dict[Color, int] = {}
     colors, numbers = np.unique(legend.reshape(-1, 3), axis=0, return_counts=True)
     for color, number in zip(colors, numbers, strict=True):

@@ -46,8 +46,7 @@ def test_what_evaluate_prints_in_the_pages_is_in_the_file() -> None:
 
     printed = set()
     for page in DOCS.glob("*.md"):
-        text = page.read_text(encoding="utf-8")
-        for line in re.findall(r"(?m)^ *mIoU +│(.*)$", text):
+        for line in re.findall(r"(?m)^ *mIoU +│(.*)$", page.read_text(encoding="utf-8")):
             printed.add(tuple(re.findall(r"[\d.]+", line)))
     assert printed
     assert printed <= known

@@ -50,8 +50,7 @@ def voxel_of(scan: DriveScan[int], point: int, size: float) -> tuple[int, ...]:
 def expected(drive: Sequence[DriveScan[int]], consensus: Consensus) -> Iterator[np.ndarray]:
     """Yield the fused probabilities by the formula of `Consensus`, point by point."""
     for current in range(len(drive)):
-        first = max(current - consensus.reach, 0)
-        reach = drive[first : current + consensus.ahead + 1]
+        reach = drive[max(current - consensus.reach, 0) : current + consensus.ahead + 1]
         votes: dict[tuple[float, tuple[int, ...]], list[tuple[float, np.ndarray]]] = {}
         for scan in reach:
             for point, scores in enumerate(scan.scores):
@@ -139,8 +138,7 @@ def test_a_scan_alone_keeps_the_labels_of_points_with_a_voxel_of_their_own() -> 
 
 
 def test_keys_tell_voxels_apart_and_give_their_places() -> None:
-    rng = np.random.default_rng(2)
-    index = rng.integers(-(2**20), 2**20, (1000, 3))
+    index = np.random.default_rng(2).integers(-(2**20), 2**20, (1000, 3))
     np.testing.assert_array_equal(index_of(keys_of(index)), index)
 
 

@@ -42,10 +42,7 @@ def test_the_better_motion_is_named(factor: float, words: str, motion: dict[str,
     after = moved_back(posts(), motion_of(**motion))
     check_fit([Pair(posts(), after, motion_of(**motion))], *NAMED)
     wrong = motion_of(**{name: factor * value for name, value in motion.items()})
-    fails(
-        lambda: check_fit([Pair(posts(), after, wrong)], *NAMED),
-        f"motions {words} as long",
-    )
+    fails(lambda: check_fit([Pair(posts(), after, wrong)], *NAMED), f"motions {words} as long")
     fails(lambda: check_fit([Pair(posts(), posts(), wrong)], *NAMED), "no motion")
 
 
@@ -54,8 +51,7 @@ def test_a_few_other_points_and_a_few_other_pairs_change_nothing() -> None:
     after = moved_back(posts(), motion)
     after[:20] += 7  # the first points, of a car that overtakes
     pair = Pair(posts(), after, motion)
-    other = Pair(posts(), posts(seed=1), motion)
-    check_fit([pair, other, pair], *NAMED)
+    check_fit([pair, Pair(posts(), posts(seed=1), motion), pair], *NAMED)
 
 
 def test_points_on_the_car_and_far_away_are_not_compared() -> None:

@@ -174,8 +174,7 @@ def test_neighbours_of_points_in_one_place_are_found_in_few_blocks(
     device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(block_search, "_nearest_of_all", None)
-    crowd = torch.ones(20_000, 3, device=device)
-    check_nearest(crowd, torch.arange(0, 20_000, 40, device=device))
+    check_nearest(torch.ones(20_000, 3, device=device), torch.arange(0, 20_000, 40, device=device))
 
 
 def test_parts_of_little_memory_change_no_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -403,8 +402,7 @@ def test_a_gpu_is_told_few_times_what_to_do_around_the_networks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model = whole_model().eval()
-    rng = np.random.default_rng(0)
-    points = rng.normal(0, (20, 20, 1, 0.1), (100_000, 4)).astype(np.float32)
+    points = np.random.default_rng(0).normal(0, (20, 20, 1, 0.1), (100_000, 4)).astype(np.float32)
     batch = PointBatch.of([Scan(points)])
 
     # The code that a GPU runs, on tensors that are none of the CPU's

@@ -93,8 +93,7 @@ class SlicesWithoutCuda(TorchFunctionMode):
         x, index = args
         index = index if isinstance(index, tuple) else (index,)
         first = x.ndim - len(index) + 1 if index[0] is Ellipsis else 0
-        slices = index[1:] if index[0] is Ellipsis else index
-        for axis, part in enumerate(slices, start=first):
+        for axis, part in enumerate(index[1:] if index[0] is Ellipsis else index, start=first):
             if part is None:
                 x = x.unsqueeze(axis)
                 continue
@@ -300,8 +299,7 @@ def batch_of(*seeds: int) -> PointBatch:
 
 
 def check_scores(engine: TorchEngine, batch: PointBatch) -> None:
-    expected = TorchEngine(WEIGHTS).score(batch)
-    torch.testing.assert_close(engine.score(batch).merged, expected.merged)
+    torch.testing.assert_close(engine.score(batch).merged, TorchEngine(WEIGHTS).score(batch).merged)
 
 
 def test_an_engine_on_a_gpu_captures_both_networks_unless_told_not_to(
@@ -394,8 +392,7 @@ def test_networks_that_cannot_be_captured_run_without_graphs_with_one_warning(
 
 
 def test_scores_that_differ_by_rounding_do_not_turn_graphs_off() -> None:
-    generator = torch.Generator().manual_seed(0)
-    f = torch.rand(5000, K, generator=generator).softmax(dim=1)
+    f = torch.rand(5000, K, generator=torch.Generator().manual_seed(0)).softmax(dim=1)
     scores = Scores(f, f[:, 0] > 2, f, f)
     rounded = f.bfloat16().float()
     for few, is_passed in ((0, True), (4, True), (6, False)):

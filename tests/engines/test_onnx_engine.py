@@ -64,8 +64,7 @@ def test_onnx_gives_the_labels_of_torch_and_exports_once(cache: Path) -> None:
         expected = expected_segmenter(points)
         actual = segmenter(points)
         for name in ("rv", "bev"):
-            difference = np.abs(getattr(actual, name) - getattr(expected, name)).max()
-            assert 0 < difference <= 1e-4
+            assert 0 < np.abs(getattr(actual, name) - getattr(expected, name)).max() <= 1e-4
         assert (actual.labels == expected.labels).mean() >= 0.9999
         assert actual.uncertain.any()
 
@@ -141,8 +140,7 @@ def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
         assert segmenter.engine.name == "int8"
     assert sum("calibrated" in line for line in said) == 1
 
-    labels = segmenter(scan).labels
-    assert 0.9 < (labels == expected).mean() < 1
+    assert 0.9 < (segmenter(scan).labels == expected).mean() < 1
 
 
 @pytest.mark.parametrize("method", ["rv", "bev"])
@@ -165,8 +163,7 @@ def test_onnx_segments_scans_in_parallel_with_one_thread_each() -> None:
 
     graph = segmenter.model.range_net
     assert isinstance(graph, OnnxGraph)
-    share = max(torch.get_num_threads() // 2, 1)
-    assert set(graph.sessions) == {torch.get_num_threads(), share}
+    assert set(graph.sessions) == {torch.get_num_threads(), max(torch.get_num_threads() // 2, 1)}
 
 
 def test_onnx_takes_scans_one_by_one() -> None:

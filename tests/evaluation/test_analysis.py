@@ -185,8 +185,7 @@ def test_analyze_writes_each_figure_as_picture_and_table(world: Path, tmp_path: 
         assert picture[..., :3].std() > 0.05  # something is drawn
     assert files(out) == names
 
-    counts = column(out / "similarity.csv", "points")
-    assert sum(map(int, counts)) == 1000
+    assert sum(map(int, column(out / "similarity.csv", "points"))) == 1000
     simple = ["arithmetic mean", "maximum", "geometric mean"]
     assert column(out / "methods.csv", "method") == ["RV", "BEV", *simple, "AMVNet"]
 
@@ -286,8 +285,7 @@ def test_ablate_scores_on_the_gpu_of_its_process(monkeypatch: pytest.MonkeyPatch
 
     source = SimpleNamespace(dataset=SimpleNamespace(taxonomy=SEMANTICKITTI))
     data = SimpleNamespace(sources=[source], val=[])
-    second = Processes(rank=1, size=2, local_rank=1)
-    plan: Any = PlanOfTwo(Recipe(), Path("out"), data, second)
+    plan: Any = PlanOfTwo(Recipe(), Path("out"), data, Processes(rank=1, size=2, local_rank=1))
     assert len(list(ablation.ablate(plan, "auto"))) == 4
     assert devices == ["cuda:1"] * 4
 

@@ -78,8 +78,7 @@ def test_clusters_are_connected_points_of_one_kind() -> None:
     assert set(ours) == set(range(count))
 
     # Each of our clusters is exactly one of the expected ones.
-    pairs = np.unique(np.stack([ours, expected]), axis=1)
-    assert pairs.shape[1] == count
+    assert np.unique(np.stack([ours, expected]), axis=1).shape[1] == count
     assert len(np.unique(expected)) == count
 
 

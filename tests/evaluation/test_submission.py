@@ -91,8 +91,7 @@ def test_the_flags_declare_what_the_method_uses(
 def test_the_golden_validation_sets_can_be_packed(name: str, folder: str, tmp_path: Path) -> None:
     spec = f"{name}:{GOLDEN / name}"
     predictions = GOLDEN / name / folder
-    out = tmp_path / "s.zip"
-    options = ("--split", "val", "--predictions", predictions, "--out", out)
+    options = ("--split", "val", "--predictions", predictions, "--out", tmp_path / "s.zip")
     assert submit(spec, *options) == (0, "")
 
 

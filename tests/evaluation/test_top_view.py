@@ -19,16 +19,14 @@ BLOCK = 400  # points of one class in one block, dense enough to fill pixels
 
 def blocks(classes: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return points in one dense block per class, and their ids."""
-    rng = np.random.default_rng(0)
-    points = rng.random((BLOCK * len(classes), 4)) * 8
+    points = np.random.default_rng(0).random((BLOCK * len(classes), 4)) * 8
     points[:, 0] += np.repeat(np.arange(len(classes)) * 10.0 - 40, BLOCK)
     return points.astype(np.float32), np.repeat(classes, BLOCK).astype(np.uint8)
 
 
 def has_color(image: np.ndarray, color: ArrayLike) -> bool:
     """Return whether more than 50 pixels have a colour, RGB in [0, 1]."""
-    difference = np.abs(image[..., :3] - np.asarray(color)).max(axis=-1)
-    return bool((difference < 2 / 255).sum() > 50)
+    return bool((np.abs(image[..., :3] - np.asarray(color)).max(axis=-1) < 2 / 255).sum() > 50)
 
 
 def class_color(class_id: int) -> tuple[float, ...]:

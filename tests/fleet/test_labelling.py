@@ -246,8 +246,7 @@ def test_names_in_a_manifest_write_nothing_elsewhere(
         with suppress(UnicodeEncodeError):  # no table can hold such a name
             block = pa.Table.from_pylist([row])
             LabelScans(request, out)(block)
-            results = Results(Place.of(f"{out}/new"), request)
-            results.add_drives(MeasureSensors(request)(block))
+            Results(Place.of(f"{out}/new"), request).add_drives(MeasureSensors(request)(block))
 
 
 def test_what_is_no_scan_is_a_broken_scan(labelling: LabellingRequest, tmp_path: Path) -> None:
@@ -321,10 +320,8 @@ def test_a_bucket_that_takes_no_labels_is_fatal(
 
 
 def test_a_row_counts_its_labels(labelling: LabellingRequest, fleet: Path, tmp_path: Path) -> None:
-    rows = label(labelling, str(tmp_path), [f"{fleet}/scans/drive0"])
-    for row in rows:
-        raw = np.fromfile(row["labels"], np.uint32)
-        ids = SEMANTICKITTI.to_train(raw)
+    for row in label(labelling, str(tmp_path), [f"{fleet}/scans/drive0"]):
+        ids = SEMANTICKITTI.to_train(np.fromfile(row["labels"], np.uint32))
         assert row["points"] == np.count_nonzero(ids)
         for index, name in enumerate(SEMANTICKITTI.classes):
             assert row["class_points"][name] == np.count_nonzero(ids == index + 1)
@@ -335,8 +332,7 @@ def test_a_row_counts_its_labels(labelling: LabellingRequest, fleet: Path, tmp_p
 
 
 def test_confidence_is_the_mean_largest_score_of_a_class() -> None:
-    k = SEMANTICKITTI.size
-    scores = np.zeros((3, k), np.float32)
+    scores = np.zeros((3, SEMANTICKITTI.size), np.float32)
     scores[[0, 1, 2], [0, 0, 5]] = [0.5, 0.75, 1.0]
     result = Segmentation(np.array([1, 1, 6], np.uint8), np.array([True, False, False]), scores)
     values = statistics(result, SEMANTICKITTI)

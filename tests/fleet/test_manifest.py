@@ -61,8 +61,7 @@ def test_only_scans_are_listed_and_those_of_other_formats_are_another_drive(tmp_
     touch(tmp_path, "a/5.bin.gz", "a/6.txt", "a/6.txt.gz", "a/.7.bin", "a/1.uncertain.npy")
     touch(tmp_path, ".hidden/8.bin", "results/part-000000.parquet")
     expected = {"a/1": "*.bin", "a/2": "*.pcd", "a/4": "*.npz", "a/5": "*.bin.gz"}
-    drives = {name: Path(drive).name for name, drive, _ in scans_of([str(tmp_path)])}
-    assert drives == expected
+    assert {name: Path(drive).name for name, drive, _ in scans_of([str(tmp_path)])} == expected
 
 
 def test_scans_have_the_names_that_predict_gives_them() -> None:
@@ -133,10 +132,9 @@ def test_a_manifest_without_paths_is_refused_in_one_line(tmp_path: Path) -> None
 def test_a_manifest_needs_each_column_once_and_all_paths(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"m{ending}"
     twice = pa.Table.from_arrays([pa.array(["a.bin"]), pa.array(["b.bin"])], ["path", "path"])
-    missing = pa.table({"path": ["a.bin", None], "name": ["a", "b"]})
     for table, words in (
         (twice, ("one column path", "found 2")),
-        (missing, ("a path in each row",)),
+        (pa.table({"path": ["a.bin", None], "name": ["a", "b"]}), ("a path in each row",)),
     ):
         if ending == ".csv":
             pa.csv.write_csv(table, path)
@@ -164,8 +162,7 @@ def test_an_output_folder_among_the_inputs_is_refused_also_through_links(tmp_pat
         ("out/old.ply", "out"),
         ("scans/loop/old.ply", "out"),
     ):
-        call = partial(scans_of, [f"{tmp_path}/{inputs}"], f"{tmp_path}/{out}")
-        fails(call, "change ")
+        fails(partial(scans_of, [f"{tmp_path}/{inputs}"], f"{tmp_path}/{out}"), "change ")
     fails(partial(scans_of, [path], f"{tmp_path}/out"), "change the output folder")
     assert len(scans_of([f"{tmp_path}/scans"], f"{tmp_path}/scans-out")) == 2
 

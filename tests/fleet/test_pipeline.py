@@ -138,8 +138,7 @@ def test_a_manifest_with_odd_rows_labels_the_others(
     assert len(error.splitlines()) == 1 + len(odd)
     assert "4 of 7 scans are labelled, 3 cannot be used" in error
     for path in paths:
-        expected = labels[f"drive2/{path.stem}.label"]
-        assert (out / f"good/{path.stem}.label").read_bytes() == expected
+        assert (out / f"good/{path.stem}.label").read_bytes() == labels[f"drive2/{path.stem}.label"]
     assert not (tmp_path / "outside.label").exists()
 
 
@@ -154,8 +153,7 @@ def test_a_label_that_is_gone_at_the_end_is_not_counted(
         return finish(run)
 
     monkeypatch.setattr(FleetRun, "finish", remove_and_finish)
-    words = command(fleet, str(tmp_path), inputs=str(fleet / "scans/drive0"))
-    code, error = run_cli(*words)
+    code, error = run_cli(*command(fleet, str(tmp_path), inputs=str(fleet / "scans/drive0")))
     assert code == 3
     assert "000001.bin: expected its labels" in error
     assert "3 of 4 scans are labelled, 1 cannot be used" in error

@@ -237,8 +237,7 @@ def test_drives_are_read_as_they_were_measured(out: Place) -> None:
     unknown = Estimate(Frame(), SensorGeometry(), quantiles=None)
     estimates = {"a": measured, "b": unknown, "c": None}
     for resume, (drive, estimate) in enumerate(estimates.items()):
-        row = describe_drive(drive, "line", estimate)
-        table = pa.Table.from_pylist([row], DRIVES_SCHEMA)
+        table = pa.Table.from_pylist([describe_drive(drive, "line", estimate)], DRIVES_SCHEMA)
         Results(out, REQUEST, resume=bool(resume)).add_drives(table)
 
     drives = Results(out, REQUEST, resume=True).estimates

@@ -77,15 +77,13 @@ def test_the_first_recording_chooses(tmp_path: Path, sensor: str, name: str, hei
     for folder, laser in (("a", sensor), ("b", "hdl32e")):
         (tmp_path / folder).mkdir()
         write(tmp_path / folder / "scan.npy", laser, height)
-    inputs = find_inputs([f"{tmp_path}/a", f"{tmp_path}/b"])
-    assert inputs.choose_weights()[0] == name
+    assert find_inputs([f"{tmp_path}/a", f"{tmp_path}/b"]).choose_weights()[0] == name
 
 
 def test_a_described_sensor_chooses_whatever_the_points_show(tmp_path: Path) -> None:
     path = str(write(tmp_path / "scan.npy", "vlp16"))
     for sensor, name in (("hdl32e", "sim-hdl32e"), ("hdl64e", "sim-hdl64e"), ("os1-64", LAST)):
-        reading = Reading(make_sensor(sensor))
-        assert find_inputs([path], reading).choose_weights()[0] == name
+        assert find_inputs([path], Reading(make_sensor(sensor))).choose_weights()[0] == name
 
 
 def test_the_classes_of_a_dataset_choose(tmp_path: Path) -> None:
@@ -109,8 +107,7 @@ def test_the_yaml_file_of_own_scans_describes_the_sensor_that_chooses(tmp_path: 
 def test_scans_that_cannot_be_read_choose_as_unknown_lasers(tmp_path: Path) -> None:
     for name in ("a.bin", "b.bin"):
         (tmp_path / name).write_bytes(b"123")
-    choice = find_inputs([str(tmp_path)]).choose_weights()
-    assert choice == (LAST, "as the lasers are unknown")
+    assert find_inputs([str(tmp_path)]).choose_weights() == (LAST, "as the lasers are unknown")
 
 
 def test_a_single_scan_that_cannot_be_read_is_refused_before_its_labels_get_a_place(

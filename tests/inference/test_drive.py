@@ -76,8 +76,7 @@ def test_past_scans_alone_give_other_labels_at_once(world: Path) -> None:
             read.append(index)
             yield points
 
-    results = amvnet.drive(segmenter, scans(), POSES, past_only=True)
-    for index, _ in enumerate(results):
+    for index, _ in enumerate(amvnet.drive(segmenter, scans(), POSES, past_only=True)):
         assert len(read) == index + 1
 
 
@@ -131,8 +130,7 @@ def test_names_in_nanoseconds_are_times(world: Path, tmp_path: Path, seconds: fl
     track = []
     for index in range(-1, 12):
         pose = POSES[max(index, 0)]
-        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        track.append([seconds + index, *pose[:3, 3], *quaternion])
+        track.append([seconds + index, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()])
     np.savetxt(tmp_path / "tum.txt", track)
     for factor, digits in ((1, 6), (10**9, 0)):
         folder = tmp_path / f"{factor}"
@@ -218,8 +216,7 @@ def test_other_poses_or_past_scans_alone_resume_no_run(world: Path, tmp_path: Pa
     refused(predict(world, out, f"--resume --past-only --poses {tmp_path}/poses.npy"), "drive")
     np.save(tmp_path / "poses.npy", np.linalg.inv(POSES[2]) @ POSES)
     refused(predict(world, out, f"--resume --poses {tmp_path}/poses.npy"), "drive")
-    command = f"predict {world}/data --weights {world}/w.safetensors --out {out} --resume"
-    refused(command, "drive")
+    refused(f"predict {world}/data --weights {world}/w.safetensors --out {out} --resume", "drive")
 
 
 def of_camera(poses: Poses) -> Poses:
@@ -381,8 +378,7 @@ def test_a_broken_scan_is_left_out_of_its_drive(world: Path, tmp_path: Path) -> 
     for name in broken:
         path = tmp_path / "data/sequences/00/velodyne" / name
         path.write_bytes(path.read_bytes()[:-3])
-    command = predict(world, tmp_path / "out", data=tmp_path / "data")
-    code, error = run_cli(*command.split())
+    code, error = run_cli(*predict(world, tmp_path / "out", data=tmp_path / "data").split())
     assert code == 3
     assert all(name in error for name in broken)
     assert len(files(tmp_path / "out")) == SCANS - len(broken)

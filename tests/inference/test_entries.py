@@ -79,8 +79,7 @@ def plain() -> np.ndarray:
 def with_rows(*rows: list[float]) -> np.ndarray:
     """Return the scan with other rows first, last and in between."""
     table = np.array(rows, np.float32)
-    places = np.linspace(0, len(plain()), len(rows)).astype(int)
-    return np.insert(plain(), places, table, axis=0)
+    return np.insert(plain(), np.linspace(0, len(plain()), len(rows)).astype(int), table, axis=0)
 
 
 def with_intensity(value: float, index: int = 700) -> np.ndarray:
@@ -150,8 +149,7 @@ class World:
 
     def write_kitti(self, points: np.ndarray) -> Path:
         root = self.folder / "kitti"
-        path = write_scan(root, "08", "000000", points[:, :4], np.zeros(len(points)))
-        return path.parents[3]
+        return write_scan(root, "08", "000000", points[:, :4], np.zeros(len(points))).parents[3]
 
     def write_own(self, points: np.ndarray) -> Path:
         path = self.folder / "own" / "own.yaml"
@@ -263,8 +261,7 @@ def by_predict_of_a_dataset(world: World, points: np.ndarray) -> np.ndarray:
 
 
 def by_evaluate_of_a_dataset(world: World, points: np.ndarray) -> np.ndarray:
-    data = str(world.write_kitti(points))
-    return _evaluated(world, open_dataset(data, SEMANTICKITTI))
+    return _evaluated(world, open_dataset(str(world.write_kitti(points)), SEMANTICKITTI))
 
 
 def _evaluated(world: World, dataset: Any) -> np.ndarray:
@@ -375,8 +372,7 @@ def test_what_is_official_of_nuscenes_labels_the_own_car(tmp_path: Path, keep_ow
     layout = make_nuscenes(tmp_path / "data")
     points, laser = on_nuscenes_car()
     own = np.array(list(map(is_on_nuscenes_car, points)))
-    table = np.column_stack([points * [1, 1, 1, 255], laser])
-    table.astype(np.float32).tofile(layout.first_points)
+    np.column_stack([points * [1, 1, 1, 255], laser]).astype(np.float32).tofile(layout.first_points)
     np.full(len(points), 1, np.uint8).tofile(layout.first_labels)
     weights = fresh_weights(NUSCENES)
     segmenter = amvnet.load(weights, keep_own=keep_own)

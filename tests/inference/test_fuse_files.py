@@ -51,8 +51,7 @@ def run_fuse(
 
 
 def read_labels(folder: Path) -> np.ndarray:
-    paths = sorted(folder.rglob("*.label"))
-    labels = [np.fromfile(path, np.uint32) for path in paths]
+    labels = [np.fromfile(path, np.uint32) for path in sorted(folder.rglob("*.label"))]
     assert labels
     return np.concatenate(labels)
 
@@ -85,8 +84,7 @@ def test_the_scores_of_predict_give_its_labels(
 
     assert (read_labels(tmp_path) == read_labels(labels[method])).mean() >= 0.999
 
-    label_files = {name for name in files(labels[method]) if name.endswith(".label")}
-    assert files(tmp_path) == label_files
+    assert files(tmp_path) == {name for name in files(labels[method]) if name.endswith(".label")}
 
 
 def test_the_head_and_tau_count(world: Path, labels: dict[str, Path], tmp_path: Path) -> None:
@@ -138,8 +136,7 @@ def test_logits_are_the_same_as_their_softmax(
     options = ("--sequences", "08", "--logits", sides)
     out = tmp_path / "out"
     assert run_fuse(world, out, *options, a=tmp_path / "a", b=tmp_path / "b") == ""
-    expected = read_labels(labels["ensemble"] / "sequences/08")
-    assert (read_labels(out) == expected).mean() >= 0.999
+    assert (read_labels(out) == read_labels(labels["ensemble"] / "sequences/08")).mean() >= 0.999
 
 
 def test_rows_of_zeros_are_no_opinion(world: Path, tmp_path: Path) -> None:
@@ -171,11 +168,9 @@ def test_rows_of_zeros_are_no_opinion(world: Path, tmp_path: Path) -> None:
 
 def test_arrays_with_rows_of_zeros_are_fused_alike() -> None:
     points = street(1, 50)[0]
-    rng = np.random.default_rng(0)
-    f, g = rng.dirichlet(np.ones(19), (2, 50)).astype(np.float32)
+    f, g = np.random.default_rng(0).dirichlet(np.ones(19), (2, 50)).astype(np.float32)
     g[:10] = 0
-    labels = fuse(points, f, g)
-    assert np.array_equal(labels[:10], f[:10].argmax(axis=1) + 1)
+    assert np.array_equal(fuse(points, f, g)[:10], f[:10].argmax(axis=1) + 1)
     with pytest.raises(ValueError, match="zeros in every row"):
         fuse(points, f, np.zeros_like(g))
 
@@ -304,8 +299,7 @@ def score_options(world: Path) -> list[Any]:
 def head(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train the head alone, on the networks' scores from files."""
     out = tmp_path_factory.mktemp("trained") / "head"
-    arguments = [*train_head_arguments(world, out), *score_options(world)]
-    assert run_cli(*arguments) == (0, "")
+    assert run_cli(*[*train_head_arguments(world, out), *score_options(world)]) == (0, "")
     return out
 
 
@@ -314,8 +308,7 @@ def test_a_head_for_files_is_that_of_networks(world: Path, head: Path, tmp_path:
     # Without the world's head, which would be trained further
     networks = tmp_path / "networks.safetensors"
     save(without(fresh_weights(), "point_head"), networks)
-    arguments = [*train_head_arguments(world, tmp_path / "run"), "--init", networks]
-    assert run_cli(*arguments) == (0, "")
+    assert run_cli(*[*train_head_arguments(world, tmp_path / "run"), "--init", networks]) == (0, "")
 
     from_networks = load(tmp_path / "run")
     from_files = load(head)
@@ -336,8 +329,7 @@ def test_fuse_takes_the_weights_of_the_head_alone(world: Path, head: Path, tmp_p
 
     points = np.fromfile(world / "data/sequences/08/velodyne/000000.bin", np.float32).reshape(-1, 4)
     f = read_probabilities(world, "rv")
-    g = read_probabilities(world, "bev")
-    ids = fuse(points, f, g, head=head)
+    ids = fuse(points, f, read_probabilities(world, "bev"), head=head)
     labels = np.fromfile(tmp_path / f"{SCAN}.label", np.uint32)
     assert np.array_equal(weights.taxonomy.to_raw(ids), labels)
 

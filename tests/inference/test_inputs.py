@@ -93,8 +93,7 @@ def test_a_later_scan_of_another_sensor_is_measured_alone_and_told(tmp_path: Pat
     write(tmp_path / "alone", "b", "vlp16", 2.5)
 
     scans, _, lines = normalised(tmp_path / "both")
-    expected = normalised(tmp_path / "alone")[0]["b"]
-    np.testing.assert_array_equal(scans["b"].points, expected.points)
+    np.testing.assert_array_equal(scans["b"].points, normalised(tmp_path / "alone")[0]["b"].points)
     assert len(lines) == 2
     assert "another sensor" in lines[1]
 
@@ -188,8 +187,7 @@ def test_recordings_of_a_run_are_judged_on_the_command_line(
         (tmp_path / name).mkdir()
         table.tofile(tmp_path / name / f"{name}.bin")
         cloud = Cloud(table[:, :3], table[:, 3], name=name)
-        scan = Normaliser(weights.expects)(Recording(name)).to_scan(cloud)
-        result = amvnet.load(weights)(scan)
+        result = amvnet.load(weights)(Normaliser(weights.expects)(Recording(name)).to_scan(cloud))
         shares[name] = f"{result.uncertain.mean():.1%}"
 
     path = save(weights, tmp_path / "w.safetensors")
@@ -344,8 +342,7 @@ def test_a_scan_that_was_read_and_moved_has_the_points_that_it_was_moved_to(tmp_
     street(0)[0].tofile(tmp_path / "a.bin")
     scan = amvnet.read(tmp_path / "a.bin")
     moved = replace(scan, points=scan.points[::2] + np.array([1, 0, 0, 0], np.float32), ring=None)
-    result = amvnet.load(weights_for())(moved)
-    np.testing.assert_array_equal(result.points, moved.points[:, :3])
+    np.testing.assert_array_equal(amvnet.load(weights_for())(moved).points, moved.points[:, :3])
 
 
 def test_a_scan_that_is_read_again_is_the_file_as_it_is_then(tmp_path: Path) -> None:

@@ -158,12 +158,10 @@ def test_other_libraries_read_the_files(kind: str, with_uncertain: bool, tmp_pat
 @pytest.mark.parametrize("kind", WITH_POINTS)
 def test_map_coordinates_keep_their_millimetres(kind: str, tmp_path: Path) -> None:
     xyz, ids, _ = make_scan(np.float64, 5_400_000.0)
-    path = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
-    written = READERS[kind](path).xyz
+    written = READERS[kind](write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)).xyz
     assert written is not None
 
-    errors = np.delete(np.abs(written - xyz), LOST, axis=0)
-    assert errors.max() < 0.0005
+    assert np.delete(np.abs(written - xyz), LOST, axis=0).max() < 0.0005
 
 
 @pytest.mark.parametrize("kind", WITH_POINTS)
@@ -180,8 +178,7 @@ def test_float64_takes_no_space_if_float32_is_exact_enough(kind: str, tmp_path: 
 @pytest.mark.parametrize("raw", [256, 260, 65535])
 def test_raw_ids_of_more_than_a_byte_survive(kind: str, raw: int, tmp_path: Path) -> None:
     taxonomy = replace(NUSCENES, train_to_raw=(0, raw, *range(2, 17)))
-    ids = np.array([1, 2])
-    path = write_scan_labels(tmp_path / "a", kind, np.zeros((2, 3)), ids, taxonomy)
+    path = write_scan_labels(tmp_path / "a", kind, np.zeros((2, 3)), np.array([1, 2]), taxonomy)
     assert READERS[kind](path).raw.tolist() == [raw, 2]
 
 
@@ -189,8 +186,7 @@ def test_raw_ids_of_more_than_a_byte_survive(kind: str, raw: int, tmp_path: Path
 @pytest.mark.parametrize("count", [0, 3])
 def test_scans_without_a_finite_point_are_written(kind: str, count: int, tmp_path: Path) -> None:
     xyz = np.full((count, 3), np.nan, np.float32)
-    ids = np.zeros(count, np.uint8)
-    path = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
+    path = write_scan_labels(tmp_path / "a", kind, xyz, np.zeros(count, np.uint8), SEMANTICKITTI)
     assert len(READERS[kind](path).raw) == count
 
 
@@ -358,8 +354,7 @@ def test_one_network_alone_reports_no_uncertain_points(world: Path, tmp_path: Pa
     assert predict(world, tmp_path, scan, *options)[0] == 0
     assert read_ply(tmp_path / "lone.ply").uncertain is None
 
-    message = failure(world, tmp_path / "other", scan, *options, "--uncertain")
-    assert "--uncertain" in message
+    assert "--uncertain" in failure(world, tmp_path / "other", scan, *options, "--uncertain")
     assert not (tmp_path / "other").exists()
 
 

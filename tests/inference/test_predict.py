@@ -311,8 +311,7 @@ def test_a_finished_run_makes_only_lost_labels(world: Path, whole: Path, tmp_pat
     (out / "000003.label").unlink()
     succeed(command)
     check_same(out, whole)
-    changed = {name for name, time in times_of(out).items() if time != times[name]}
-    assert changed == {"000003.label"}
+    assert {name for name, time in times_of(out).items() if time != times[name]} == {"000003.label"}
 
 
 def test_a_run_repeats_scans_and_keeps_the_others(world: Path, whole: Path, tmp_path: Path) -> None:
@@ -361,8 +360,7 @@ def test_a_scan_that_was_rewritten_is_segmented_again(world: Path, tmp_path: Pat
     times = times_of(out)
     shutil.copy(scans / "000005.bin", scans / "000008.bin")
     succeed(command)
-    changed = {name for name, time in times_of(out).items() if time != times[name]}
-    assert changed == {"000008.label"}
+    assert {name for name, time in times_of(out).items() if time != times[name]} == {"000008.label"}
     assert (out / "000008.label").read_bytes() == (out / "000005.label").read_bytes()
 
 
@@ -444,8 +442,7 @@ def test_the_end_counts_the_classes_of_the_label_files_and_names_commands_that_r
         for name in np.asarray(SEMANTICKITTI.names)[ids]:
             counts[name] = counts.get(name, 0) + 1
     rows = re.findall(r"^ ([\w-]+) +│ +([\d,]+) │ +([\d.]+)", printed, re.M)
-    shown = {name: int(points.replace(",", "")) for name, points, _ in rows}
-    assert shown == counts
+    assert {name: int(points.replace(",", "")) for name, points, _ in rows} == counts
     assert sum(float(share) for *_, share in rows) == pytest.approx(100, abs=1)
 
     view = re.search(r"^look at them: amvnet (.*)$", first, re.M)
@@ -671,8 +668,7 @@ def test_scans_that_vanish_during_a_run_are_listed_and_the_others_are_done(
     assert "2 of 4 scans are labelled, 2 cannot be used" in last
     for name, fault in zip(("000000", "000002"), faults, strict=True):
         assert f"{folder / name}.bin: expected" in fault
-    labels = sorted(path.stem for path in (tmp_path / "out").rglob("*.label"))
-    assert labels == ["000001", "000003"]
+    assert sorted(path.stem for path in (tmp_path / "out").rglob("*.label")) == ["000001", "000003"]
 
 
 def test_a_scan_that_vanishes_after_it_was_read_has_its_labels(world: Path, tmp_path: Path) -> None:
@@ -688,10 +684,9 @@ def test_a_scan_that_vanishes_after_it_was_read_has_its_labels(world: Path, tmp_
 def test_a_bag_in_a_folder_is_labelled_again_if_one_of_its_files_changed(tmp_path: Path) -> None:
     bag = tmp_path / "drive"
     bag.mkdir()
-    recording = Recording("drive")
     scan = ScanFile(
         "drive/000000",
-        recording,
+        Recording("drive"),
         bag,
         prediction="drive/000000.label",
         dataset=ScanFiles([]),
@@ -700,8 +695,7 @@ def test_a_bag_in_a_folder_is_labelled_again_if_one_of_its_files_changed(tmp_pat
     for content in (b"1", b"22"):
         (bag / "drive.mcap").write_bytes(content)
         os.utime(bag, (0, 0))  # the folder says nothing of what is in its files
-        output = OutputOptions(tmp_path / "out")
-        origins.append(Pipeline([scan], lambda *_: [], output)._origins)
+        origins.append(Pipeline([scan], lambda *_: [], OutputOptions(tmp_path / "out"))._origins)
     assert origins[0] != origins[1]
 
 

@@ -111,8 +111,7 @@ def test_torch_has_its_threads_back_after_the_stream() -> None:
 
 
 def _evaluated(dataset: Dataset, segmenter: Segmenter) -> Any:
-    records = dataset.records(["08"])
-    return evaluate(dataset, records, label_by_weights(segmenter)).report("x")
+    return evaluate(dataset, dataset.records(["08"]), label_by_weights(segmenter)).report("x")
 
 
 def _analyzed(dataset: Dataset, segmenter: Segmenter) -> Any:
@@ -126,8 +125,7 @@ def _ranked(dataset: Dataset, segmenter: Segmenter) -> Any:
 
 def _viewed(dataset: Dataset, segmenter: Segmenter) -> Any:
     scans, _ = find_inputs([dataset.spec]).scans()
-    shown = show_scans(scans, segmenter)
-    return [[each.name, each.labels["amvnet"].tolist()] for each in shown]
+    return [[each.name, each.labels["amvnet"].tolist()] for each in show_scans(scans, segmenter)]
 
 
 @pytest.mark.parametrize(

@@ -118,8 +118,7 @@ def test_lost_points_stay_in_place_and_change_nothing(method: MethodName) -> Non
 
 @pytest.mark.parametrize("far", [1e20, 3e38, -1e30])
 def test_absurd_points_stay_alone(segmenter: Segmenter, result: Segmentation, far: float) -> None:
-    points = np.concatenate([POINTS, [[far, 1, 1, 0.5]]]).astype(np.float32)
-    actual = segmenter(points)
+    actual = segmenter(np.concatenate([POINTS, [[far, 1, 1, 0.5]]]).astype(np.float32))
     assert np.array_equal(actual.scores[:-1], result.scores)
     assert actual.labels[-1] == 0
 
@@ -213,8 +212,7 @@ def test_names_of_columns_may_be_a_list(segmenter: Segmenter, result: Segmentati
 
 def test_half_precision_is_read(segmenter: Segmenter) -> None:
     halves = torch.from_numpy(POINTS).bfloat16()
-    expected = segmenter(halves.float().numpy()).labels
-    assert np.array_equal(segmenter(halves).labels, expected)
+    assert np.array_equal(segmenter(halves).labels, segmenter(halves.float().numpy()).labels)
 
 
 def test_masked_points_are_lost(segmenter: Segmenter) -> None:
@@ -319,8 +317,7 @@ def test_weights_may_be_given_as_a_path(tmp_path: Path) -> None:
 
 
 def test_tau_is_that_of_the_weights_unless_it_is_given(result: Segmentation) -> None:
-    same = amvnet.load(WEIGHTS, tau=THRESHOLD)(POINTS)
-    assert np.array_equal(same.scores, result.scores)
+    assert np.array_equal(amvnet.load(WEIGHTS, tau=THRESHOLD)(POINTS).scores, result.scores)
 
     shares = []
     for tau in (0.0, 0.5 * THRESHOLD, THRESHOLD, 1.0):
@@ -352,8 +349,7 @@ def test_an_unknown_device_or_method_is_refused(option: str, value: Any) -> None
 def test_rows_by_ring_need_a_ring() -> None:
     segmenter = amvnet.load(fresh_weights(NUSCENES))
     fails(lambda: segmenter(POINTS), "ring")
-    ring = rings_of(POINTS, 32)
-    assert segmenter(Scan(POINTS, ring=ring)).labels.max() <= 16
+    assert segmenter(Scan(POINTS, ring=rings_of(POINTS, 32))).labels.max() <= 16
 
 
 def test_the_columns_of_a_file_are_as_the_user_says(tmp_path: Path) -> None:

@@ -31,14 +31,12 @@ def with_usual(share: Any) -> Weights:
 
 @pytest.mark.parametrize("share", [0, 0.0, 0.125, 1.0])
 def test_the_usual_share_is_that_of_the_validation(share: float, tmp_path: Path) -> None:
-    path = save(with_usual(share), tmp_path / "w.safetensors")
-    assert load(path).usual_uncertain == share
+    assert load(save(with_usual(share), tmp_path / "w.safetensors")).usual_uncertain == share
 
 
 @pytest.mark.parametrize("metrics", [{}, {"point_head": {}}])
 def test_weights_that_do_not_say_have_a_default(metrics: dict[str, Any]) -> None:
-    weights = replace(fresh_weights(), metrics=metrics)
-    assert weights.usual_uncertain == USUAL_UNCERTAIN
+    assert replace(fresh_weights(), metrics=metrics).usual_uncertain == USUAL_UNCERTAIN
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan"), "0.5", None, [0.5]])
@@ -53,8 +51,7 @@ def test_a_share_that_is_none_is_not_believed(share: object) -> None:
 def test_the_usual_share_is_trusted_and_disagreement_everywhere_is_not(usual: float) -> None:
     assert not Verdict(usual, usual).is_doubtful
     assert Verdict(1.0, usual).is_doubtful
-    shares = np.linspace(0, 1, 101)
-    doubtful = [Verdict(share, usual).is_doubtful for share in shares]
+    doubtful = [Verdict(share, usual).is_doubtful for share in np.linspace(0, 1, 101)]
     assert doubtful == sorted(doubtful)  # once doubtful, always doubtful
 
 

@@ -193,8 +193,7 @@ def test_devices_of_a_type_differ_a_little() -> None:
         assert abs(device.height - HDL64E.height) <= 0.15
         assert abs(device.pitch) <= 1.5
         assert abs(device.roll) <= 1.5
-        offsets = np.array(device.elevations) - np.array(HDL64E.elevations)
-        assert np.abs(offsets).max() < 0.7
+        assert np.abs(np.array(device.elevations) - np.array(HDL64E.elevations)).max() < 0.7
         assert (np.diff(device.elevations) <= 0).all()
     assert len({device.height for device in devices}) == 20
     assert draw_device(exact_device(HDL64E), np.random.default_rng(0)) == exact_device(HDL64E)
@@ -205,8 +204,7 @@ def test_a_long_sequence_continues_in_another_street() -> None:
     pytest.importorskip("embreex")
     drive = Drive(scans_per_street=1)
     scans = drive_street(HDL64E, 2, np.random.SeedSequence(1), drive)
-    positions = [scan.pose[0, 3] for scan in scans]
-    assert np.allclose(positions, [0, drive.spacing])
+    assert np.allclose([scan.pose[0, 3] for scan in scans], [0, drive.spacing])
 
 
 @pytest.mark.parametrize(

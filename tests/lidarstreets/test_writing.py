@@ -70,8 +70,7 @@ def table(folder: Path, name: str) -> list[dict[str, Any]]:
 
 @pytest.mark.full
 def test_two_processes_write_the_same_bytes_as_one(real_nuscenes: Path, tmp_path: Path) -> None:
-    again = simulate(tmp_path, **SETTINGS, processes=2)
-    assert contents(again) == contents(real_nuscenes)
+    assert contents(simulate(tmp_path, **SETTINGS, processes=2)) == contents(real_nuscenes)
 
 
 def test_a_stopped_simulation_ends_the_same(nuscenes: Path, quick: None, tmp_path: Path) -> None:
@@ -94,9 +93,8 @@ SCANS = 1000  # of each sequence, far more than are ever written
 def run_on_two_processes(out: Path) -> subprocess.Popen[bytes]:
     """Start a long simulation, as the leader of a group of processes; return once it writes."""
     command = [sys.executable, "-m", "lidarstreets", str(out)]
-    options = ["--sequences", "2", "--scans", str(SCANS), "--processes", "2"]
     parent = subprocess.Popen(
-        [*command, *options],
+        [*command, *["--sequences", "2", "--scans", str(SCANS), "--processes", "2"]],
         stderr=subprocess.PIPE,
         start_new_session=True,
         # Tests that a shell started in the background ignore SIGINT.
@@ -301,5 +299,4 @@ def test_a_robots_scans_can_be_extended(quick: None, tmp_path: Path) -> None:
     assert "val: site_b" in (tmp_path / "robot.yaml").read_text()
     labels = np.load(tmp_path / "site_b/truth/0000.npy")
     assert set(labels.tolist()) <= {-1, 3, 7, 9, 21, 22, 40}
-    header = (tmp_path / "site_b/clouds/0000.pcd").read_bytes()
-    assert f"POINTS {len(labels)}\n".encode() in header
+    assert f"POINTS {len(labels)}\n".encode() in (tmp_path / "site_b/clouds/0000.pcd").read_bytes()

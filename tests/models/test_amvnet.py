@@ -256,8 +256,7 @@ def test_disputed_points_equal_a_loop_over_the_uncertain_ones() -> None:
     assert disputed_points(f, g, uncertain, 1.0).sum() < sum(expected)
     assert 0 < sum(expected) < uncertain.sum()
     assert disputed_points(f, g, uncertain, 0.0).equal(uncertain)
-    nothing = torch.zeros(len(f), dtype=torch.bool)
-    assert not disputed_points(f, g, nothing, 2.0).any()
+    assert not disputed_points(f, g, torch.zeros(len(f), dtype=torch.bool), 2.0).any()
 
 
 def test_the_head_gets_disputed_points_and_uncertain_stay(random_scan: RandomScan) -> None:

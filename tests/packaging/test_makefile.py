@@ -17,9 +17,8 @@ pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make
 def run_make(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Run make as a user does, though `make test` may run this: make inside make says more."""
     alone = {name: value for name, value in os.environ.items() if "MAKE" not in name}
-    command = ["make", *words]
     return subprocess.run(
-        command, cwd=folder, env=alone, capture_output=True, text=True, check=False
+        ["make", *words], cwd=folder, env=alone, capture_output=True, text=True, check=False
     )
 
 

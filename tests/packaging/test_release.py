@@ -70,8 +70,7 @@ def run_release(root: Path, version: str) -> subprocess.CompletedProcess[str]:
 
 def git(root: Path, *words: str) -> str:
     command = ["git", "-C", str(root), *words]
-    environment = os.environ | AUTHOR
-    return subprocess.run(command, capture_output=True, text=True, env=environment).stdout
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | AUTHOR).stdout
 
 
 def test_a_release_is_a_tagged_commit_whose_notes_are_those_of_the_tag(tmp_path: Path) -> None:

@@ -86,8 +86,7 @@ def start(monkeypatch: pytest.MonkeyPatch, weights: Path) -> Iterator[Start]:
     nodes = []
 
     def start_node(**parameters: Any) -> Any:
-        module = install(monkeypatch, **{"weights": str(weights), **parameters})
-        nodes.append(module.SegmentNode())
+        nodes.append(install(monkeypatch, **{"weights": str(weights), **parameters}).SegmentNode())
         return nodes[-1]
 
     yield start_node
@@ -130,8 +129,7 @@ def test_labels_are_those_of_predict_on_a_bag(
     node = start(height=1.7, engine="torch")
     for number, points in enumerate(scans):
         send(node, ros_message(points, padded=padded))
-        cloud = over_the_wire(node.publishers["~/cloud"].messages[-1])
-        records = np.frombuffer(cloud.data, RECORD)
+        records = np.frombuffer(over_the_wire(node.publishers["~/cloud"].messages[-1]).data, RECORD)
 
         stem = tmp_path / "out/bag" / f"{number:06d}"
         raw = np.load(f"{stem}.npy")
@@ -308,8 +306,7 @@ def test_a_wrong_parameter_is_one_line_and_exit_code_2(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("OMP_WAIT_POLICY", "active")  # undoes what `main` sets
-    module = install(monkeypatch, **{"weights": str(weights), **parameters})
-    assert module.main([]) == 2
+    assert install(monkeypatch, **{"weights": str(weights), **parameters}).main([]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert words in error
@@ -383,8 +380,7 @@ def warnings_of(node: Any) -> list[str]:
 def test_scans_are_fused_with_past_scans_as_by_predict_on_a_bag(
     start: Start, weights: Path, tmp_path: Path, drive: Drive
 ) -> None:
-    sent = [*drive_odometry(DRIVE_SCANS), *drive_clouds(DRIVE_SCANS)]
-    bag = write_bag(tmp_path / "bag", sent)
+    bag = write_bag(tmp_path / "bag", [*drive_odometry(DRIVE_SCANS), *drive_clouds(DRIVE_SCANS)])
     options = "--drive --past-only --poses /odom --format npy"
     for name, value in SENSOR.items():
         options += f" --{name.replace('_', '-')} {value}"
@@ -478,8 +474,7 @@ def test_a_bag_played_twice_has_the_same_labels(start: Start, drive: Drive) -> N
     np.testing.assert_array_equal(labels_of(node)[4], alone(start, drive.messages[:1])[0])
     again = label_all(node, drive.messages[1:4])[5:]
 
-    fresh = fusing(start, drive)
-    np.testing.assert_array_equal(again, label_all(fresh, drive.messages[1:4]))
+    np.testing.assert_array_equal(again, label_all(fusing(start, drive), drive.messages[1:4]))
     assert len(first) == 4
 
 
@@ -488,8 +483,7 @@ def test_odometry_that_jumps_starts_anew(
 ) -> None:
     # The jump shows only after the networks have seen the scan, turned or not.
     monkeypatch.setattr("amvnet.inference.drive.TURN", 0.0)
-    fresh = fusing(start, drive)
-    expected = label_all(fresh, drive.messages[2:4])
+    expected = label_all(fusing(start, drive), drive.messages[2:4])
 
     node = start(odom_frame="odom", **SENSOR)
     moved = np.eye(4)
@@ -510,8 +504,7 @@ def test_only_scans_in_reach_are_in_memory() -> None:
     for stamp in range(3 * REACH):
         scores = rng.dirichlet(np.ones(4), 50).astype(np.float32)
         result = Segmentation(np.ones(50, np.uint8), np.zeros(50, bool), scores)
-        scan = Scan(rng.normal(0, 5, (50, 4)).astype(np.float32))
-        fuse(Message(stamp, "lidar"), scan, result)
+        fuse(Message(stamp, "lidar"), Scan(rng.normal(0, 5, (50, 4)).astype(np.float32)), result)
     assert scans_in_memory() <= before + REACH + 2
 
 

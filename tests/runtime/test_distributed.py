@@ -127,8 +127,7 @@ def largest_difference(a: Weights, b: Weights) -> float:
     assert set(a.tensors) == set(b.tensors)
     largest = 0.0
     for name, tensor in a.tensors.items():
-        difference = (tensor.double() - b.tensors[name].double()).abs().max()
-        largest = max(largest, float(difference))
+        largest = max(largest, float((tensor.double() - b.tensors[name].double()).abs().max()))
     return largest
 
 
@@ -227,8 +226,7 @@ def test_processes_validate_every_scan_once(size: int, count: int) -> None:
     scans = ScanSet(TrainingData([Source(dataset, records)]), Expectation())
     keys: list[tuple[int, int]] = []
     for rank in range(count):
-        loader = make_loader(scans, 1, 0, shuffle=False, processes=Processes(rank, count))
-        keys += loader.sampler
+        keys += make_loader(scans, 1, 0, shuffle=False, processes=Processes(rank, count)).sampler
     assert sorted(keys) == [(0, index) for index in range(size)]
 
 

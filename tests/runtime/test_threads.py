@@ -84,8 +84,7 @@ def test_the_command_line_lets_threads_sleep_before_it_imports_torch() -> None:
 @pytest.mark.parametrize(("name", "value"), [("OMP_WAIT_POLICY", "active"), ("KMP_BLOCKTIME", "7")])
 def test_what_the_user_has_set_stays(name: str, value: str) -> None:
     expected = [value if variable == name else "None" for variable in WAITING]
-    output = run_python(PRINTING, *WAITING, environment={name: value})
-    assert output.split() == ["False", *expected]
+    assert run_python(PRINTING, *WAITING, environment={name: value}).split() == ["False", *expected]
 
 
 @pytest.fixture

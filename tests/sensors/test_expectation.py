@@ -52,8 +52,7 @@ def trained_at(height: float, root: Path) -> Weights:
 @pytest.mark.full
 @pytest.mark.parametrize("height", [0.8, 1.73, 2.6])
 def test_datasets_folders_files_and_bags_get_the_same_labels(height: float, tmp_path: Path) -> None:
-    weights = trained_at(height, tmp_path / "data")
-    save(weights, tmp_path / "w.safetensors")
+    save(trained_at(height, tmp_path / "data"), tmp_path / "w.safetensors")
     scans = sorted((tmp_path / "data/sequences/08/velodyne").glob("*.bin"))
     clouds = [np.fromfile(path, np.float32).reshape(-1, 4) for path in scans]
     write_bag1(tmp_path / "drive.bag", {"/points": clouds})
@@ -137,8 +136,7 @@ WHOLE = Expectation(
 
 @pytest.mark.parametrize("expects", [WHOLE, Expectation(), replace(WHOLE, as_is=False)])
 def test_an_expectation_survives_json(expects: Expectation) -> None:
-    text = json.dumps(expects.to_dict())
-    assert Expectation.from_dict(json.loads(text), expects.view) == expects
+    assert Expectation.from_dict(json.loads(json.dumps(expects.to_dict())), expects.view) == expects
 
 
 @pytest.mark.parametrize(

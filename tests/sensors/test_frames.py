@@ -115,8 +115,7 @@ def test_lasers_tell_a_low_sensor_from_the_foot_of_a_vehicle(name: str, height: 
     assert "--offset 0,0,-Z if" in line
     assert "--offset" not in normalise(xyz, Sensor(offset=(0, 0, -1)))[1]
     assert "over the ground" not in line
-    stated = normalise(xyz, Sensor(height=1.41))[1]
-    assert "sensor 1.41 m over the ground, the ground at" in stated
+    assert "sensor 1.41 m over the ground, the ground at" in normalise(xyz, Sensor(height=1.41))[1]
 
 
 @pytest.mark.parametrize("z", [-1.73, 0, 1.73])
@@ -154,8 +153,7 @@ def test_other_units_are_refused_with_the_option_that_mends_it(unit: str, factor
 
 
 def test_map_coordinates_are_not_taken_for_millimetres() -> None:
-    xyz = scan_xyz() + np.array([4500, 300, 0])
-    assert find_frame(xyz, Sensor()).unit == "m"
+    assert find_frame(scan_xyz() + np.array([4500, 300, 0]), Sensor()).unit == "m"
 
 
 def test_the_height_is_that_over_the_ground_under_the_car() -> None:
@@ -163,8 +161,7 @@ def test_the_height_is_that_over_the_ground_under_the_car() -> None:
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-25, 25, (2, 20_000))
     z = np.where(np.abs(y) < 5, -1.73, -2.1) + rng.normal(0, 0.02, len(x))
-    frame = find_frame(np.column_stack([x, y, z]), Sensor())
-    assert frame.height == pytest.approx(1.73, abs=0.1)
+    assert find_frame(np.column_stack([x, y, z]), Sensor()).height == pytest.approx(1.73, abs=0.1)
 
 
 def test_a_bank_of_which_little_is_seen_moves_no_scan() -> None:
@@ -180,8 +177,7 @@ def test_the_walls_of_a_corridor_are_not_taken_for_the_ground() -> None:
     rng = np.random.default_rng(0)
     x = rng.uniform(-20, 20, 20_000)
     y = np.where(rng.random(20_000) < 0.5, 1.2, -1.2) + rng.normal(0, 0.01, 20_000)
-    walls = np.column_stack([x, y, rng.uniform(-0.2, 2, 20_000)])
-    frame = find_frame(walls, Sensor())
+    frame = find_frame(np.column_stack([x, y, rng.uniform(-0.2, 2, 20_000)]), Sensor())
     assert (frame.axes, frame.pitch, frame.roll) == ("x-forward", 0, 0)
 
 
@@ -205,5 +201,4 @@ def test_scans_that_sway_are_levelled_one_by_one(tilt: tuple[float, float]) -> N
         cloud = Cloud(
             tilted(xyz, side * pitch, side * roll), np.linspace(0, 0.6, len(xyz)), name="a"
         )
-        scan = recording.to_scan(cloud)
-        np.testing.assert_allclose(scan.points[:, 2], xyz[:, 2], atol=0.2)
+        np.testing.assert_allclose(recording.to_scan(cloud).points[:, 2], xyz[:, 2], atol=0.2)

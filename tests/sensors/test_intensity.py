@@ -73,8 +73,7 @@ def normalise(
 
 def quantile_gap(intensity: np.ndarray) -> float:
     """Return by how much the quarters of intensities differ from those of the training."""
-    quarters = np.quantile(intensity, (0.25, 0.5, 0.75))
-    return float(np.abs(quarters - TRAINED[4:7]).max())
+    return float(np.abs(np.quantile(intensity, (0.25, 0.5, 0.75)) - TRAINED[4:7]).max())
 
 
 def test_intensities_like_those_of_the_training_stay_as_they_are() -> None:
@@ -155,8 +154,7 @@ def test_missing_intensities_suit_the_weights(intensity: float | None, is_option
     xyz = scan_points()[:, :3]
     values = None if intensity is None else np.full(len(xyz), intensity)
 
-    clouds = [Cloud(xyz, values, name="a")] * 2
-    (scan, again), lines = normalise(clouds, is_optional=is_optional)
+    (scan, again), lines = normalise([Cloud(xyz, values, name="a")] * 2, is_optional=is_optional)
     assert scan.valid.all()
     np.testing.assert_array_equal(scan.points, again.points)
     if is_optional:
@@ -292,8 +290,7 @@ def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> Non
     dark[:, 3] = points[:, 3] ** 2 / 2
     segmenter = amvnet.load(weights)
     expected = segmenter(points)
-    darker = segmenter(dark)
-    np.testing.assert_allclose(darker.scores, expected.scores, atol=0.02)
+    np.testing.assert_allclose(segmenter(dark).scores, expected.scores, atol=0.02)
 
     # The scan is labelled alike as a file: its normaliser leaves the intensities to the segmenter.
     said: list[str] = []

@@ -170,5 +170,4 @@ def test_the_lasers_of_every_real_kitti_scan_are_found() -> None:
     paths = sorted(Path(os.environ["AMVNET_REAL_DATA"]).glob("semantickitti/**/velodyne/*.bin"))
     assert paths
     for path in paths:
-        points = np.fromfile(path, np.float32).reshape(-1, 4)
-        assert lasers_by_order(points, 64) is not None, path
+        assert lasers_by_order(np.fromfile(path, np.float32).reshape(-1, 4), 64) is not None, path

@@ -61,8 +61,7 @@ def test_the_box_of_the_body_is_measured_and_its_share_of_the_points() -> None:
     body = found(scans)
     assert body is not None
     np.testing.assert_allclose(body.box, BODY, atol=0.11)
-    points = np.concatenate(scans)
-    assert body.share == pytest.approx(is_inside(points, body.box).mean())
+    assert body.share == pytest.approx(is_inside(np.concatenate(scans), body.box).mean())
     assert np.array(body.box).tolist() == np.round(body.box, 1).tolist()
     assert make_sensor(own_body=list(body.box)).own_body == body.box
 
@@ -77,8 +76,7 @@ def test_the_box_of_the_body_is_measured_and_its_share_of_the_points() -> None:
     ],
 )
 def test_the_box_is_in_metres_and_the_files_axes(change: Any, sensor: dict[str, Any]) -> None:
-    scans = drive()
-    body = found([change(xyz) for xyz in scans], **sensor)
+    body = found([change(xyz) for xyz in drive()], **sensor)
     assert body is not None
     unit = 1000 if change(np.eye(3))[0, 0] == 1000 else 1
     corners = change(np.array([BODY[:3], BODY[3:]])) / unit

@@ -32,8 +32,7 @@ BOX = (-1.0, -2.0, -0.5, 14.0, 5.0, 0.6)
 def own_of(points: np.ndarray, **sensor: Any) -> np.ndarray:
     """Return the points of the own body in a scan without rings, as a file holds it."""
     cloud = Cloud(points[:, :3], points[:, 3])
-    normaliser = Normaliser(Expectation(), make_sensor(**sensor))
-    own = normaliser(Recording("drive")).to_scan(cloud).own
+    own = Normaliser(Expectation(), make_sensor(**sensor))(Recording("drive")).to_scan(cloud).own
     return np.zeros(len(points), bool) if own is None else own
 
 
@@ -139,8 +138,7 @@ def test_predict_counts_own_points(tmp_path: Path, capsys: pytest.CaptureFixture
 
 @pytest.mark.skipif("AMVNET_REAL_DATA" not in os.environ, reason="needs real scans")
 def test_nearly_all_points_that_nuscenes_calls_its_car_are_found_and_hardly_others() -> None:
-    root = Path(os.environ["AMVNET_REAL_DATA"]) / "lidarseg"
-    dataset = NuScenes(root)
+    dataset = NuScenes(Path(os.environ["AMVNET_REAL_DATA"]) / "lidarseg")
     names = {row["index"]: row["name"] for row in dataset._table("category")}
     of_body = Counter[str]()
     of_others = Counter[str]()

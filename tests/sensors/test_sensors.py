@@ -291,8 +291,7 @@ def test_points_whose_ring_is_unknown_get_no_row_by_their_ring() -> None:
 
 def rows_in_nuscenes(scan: Scan) -> np.ndarray:
     """Return the (N,) rows of a scan in the range image of weights whose rows are rings."""
-    view = RangeView(NUSCENES_WEIGHTS.model.range_view)
-    return view.rows(PointBatch.of([scan])).numpy()
+    return RangeView(NUSCENES_WEIGHTS.model.range_view).rows(PointBatch.of([scan])).numpy()
 
 
 def test_weights_of_an_unknown_sensor_get_rows_if_the_number_of_lasers_fits() -> None:
@@ -404,8 +403,7 @@ def test_the_sensor_of_the_training_is_said_to_be_familiar_and_in_place() -> Non
 
 def rise_of(recording: Normalised, points: np.ndarray) -> float:
     """Return how far a scan of a recording is moved up, metres."""
-    scan = recording.to_scan(make_cloud(points))
-    return float((scan.points[:, 2] - points[:, 2]).mean())
+    return float((recording.to_scan(make_cloud(points)).points[:, 2] - points[:, 2]).mean())
 
 
 def test_scans_of_one_source_keep_one_height() -> None:
@@ -423,8 +421,7 @@ def test_scans_of_two_robots_in_one_source_get_their_own_heights() -> None:
     recording, _ = make_recording()
     for height in (1.0, 2.5, 1.0, 2.5):
         points, _ = place(LASERS["os1-64"], height)
-        rise = rise_of(recording, points)
-        assert rise == pytest.approx(height - 1.73, abs=0.05)
+        assert rise_of(recording, points) == pytest.approx(height - 1.73, abs=0.05)
 
 
 COORDINATE = (
@@ -669,8 +666,7 @@ def test_scans_of_a_benchmark_are_normalised_for_weights_that_do_not_know_its_se
 @pytest.mark.parametrize("seed", range(4))
 def test_random_bytes_as_points_give_no_warning(seed: int) -> None:
     # Signalling NaN, infinity and numbers close to the largest are among them.
-    data = np.random.default_rng(seed).bytes(16 * 5000)
-    points = np.frombuffer(data, np.float32).reshape(-1, 4)
+    points = np.frombuffer(np.random.default_rng(seed).bytes(16 * 5000), np.float32).reshape(-1, 4)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         raised = raise_points(Scan(points), 0.5)

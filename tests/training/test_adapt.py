@@ -239,8 +239,7 @@ def test_adapted_weights_expect_the_scans_of_the_weights_that_taught(world: Path
 
 
 def test_streets_need_a_sensor_that_can_be_simulated(world: Path, tmp_path: Path) -> None:
-    line = command(world, tmp_path / "run").replace("--streets 0", "--streets 0.5")
-    refused(line, "--streets 0")
+    refused(command(world, tmp_path / "run").replace("--streets 0", "--streets 0.5"), "--streets 0")
     assert not (tmp_path / "run").exists()
 
 

@@ -170,8 +170,7 @@ def test_some_scans_have_no_intensity(random_scan: RandomScan) -> None:
     scan = random_scan(50)
     sums = []
     for seed in range(100):
-        changed = augmented(scan, replace(OFF, no_intensity=0.3), seed)
-        sums.append(changed.points[:, 3].sum())
+        sums.append(augmented(scan, replace(OFF, no_intensity=0.3), seed).points[:, 3].sum())
 
     assert set(np.round(sums, 3)) == {0, np.round(scan.points[:, 3].sum(), 3)}
     assert 15 < sums.count(0) < 45
@@ -188,8 +187,7 @@ def test_a_mixed_scan_has_one_sector_of_another_scan(random_scan: RandomScan) ->
         is_foreign = from_other_scan(mixed, scan, other)
 
         around = is_foreign[np.argsort(azimuths(mixed))]
-        borders = np.count_nonzero(around != np.roll(around, 1))
-        assert borders == 2
+        assert np.count_nonzero(around != np.roll(around, 1)) == 2
         shares.append(is_foreign.sum() / len(other))
 
     assert 0.2 < min(shares) < 0.4
@@ -478,5 +476,4 @@ def test_lost_returns_and_other_classes_are_not_pasted(random_scan: RandomScan) 
     pasted = paste(scan, Scan(points, labels, other.ring), [1], np.random.default_rng(0))
     assert pasted.valid[len(scan) :].all()
     assert (len(pasted) - len(scan)) % 40 == 0
-    nothing = paste(scan, other, [], np.random.default_rng(0))
-    assert np.array_equal(nothing.points, scan.points)
+    assert np.array_equal(paste(scan, other, [], np.random.default_rng(0)).points, scan.points)

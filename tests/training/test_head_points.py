@@ -33,8 +33,7 @@ def epoch(sampler: PointSampler, number: int) -> list[int]:
 
 
 def test_an_epoch_has_all_points_once_unless_fewer_are_drawn() -> None:
-    sampler = sampler_of(HeadTraining(batch=100))
-    assert sorted(epoch(sampler, 0)) == list(range(1000))
+    assert sorted(epoch(sampler_of(HeadTraining(batch=100)), 0)) == list(range(1000))
 
 
 def test_each_epoch_draws_other_points_each_once() -> None:

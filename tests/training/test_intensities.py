@@ -116,8 +116,7 @@ def test_streets_that_are_joined_with_others_are_matched_as_streets_alone(
 ) -> None:
     monkeypatch.setattr(simulated, "drive_street", fake_drive)
     monkeypatch.setattr(simulated, "SCANS", 2)
-    augment = {"no_intensity": 0.25}
-    write_recipe(tmp_path / "recipe.yaml", training={"augment": augment})
+    write_recipe(tmp_path / "recipe.yaml", training={"augment": {"no_intensity": 0.25}})
     specs = [f"simulated-hdl64e:{tmp_path / name}" for name in "ab"]
     found: list[Any] = []
     for data in (specs[:1], specs):

@@ -88,8 +88,7 @@ def test_all_scans_of_a_mixed_dataset_take_equally_many_turns(tmp_path: Path) ->
 
 def test_a_mixed_scan_is_read_from_its_own_dataset(tmp_path: Path) -> None:
     data = mixed(tmp_path, 0)
-    b = open_dataset(str(tmp_path / "b"))
-    expected = b.read(data.in_epoch(1, 2)[3])
+    expected = open_dataset(str(tmp_path / "b")).read(data.in_epoch(1, 2)[3])
     scan = data.read(4 + 3, epoch=2)
     np.testing.assert_array_equal(scan.points, expected.points)
     np.testing.assert_array_equal(scan.labels, expected.labels)
@@ -111,8 +110,7 @@ def test_the_check_finds_others_classes(tmp_path: Path, monkeypatch: pytest.Monk
     b = open_dataset(str(make_streets(tmp_path / "b", ("00",), 14)))
     lines: list[str] = []
     data = TrainingData([Source(each, each.records(["00"])) for each in (a, b)], 0.5)
-    recipe = load_recipe("semantickitti-compact")
-    plan = Plan(recipe, data, tmp_path / "run", report=lines.append)
+    plan = Plan(load_recipe("semantickitti-compact"), data, tmp_path / "run", report=lines.append)
     _, taught = check_data(plan)
     car = SEMANTICKITTI.classes.index("car")
     assert taught[1, car]
@@ -289,8 +287,7 @@ def test_the_mean_with_initial_weights_needs_their_classes() -> None:
     assert recipe.training.rv.initial > 0
     lines: list[str] = []
     for init in (None, fresh_weights()):
-        same = without_initial_weights(recipe, init, SEMANTICKITTI, ("rv",), lines.append)
-        assert same is recipe
+        assert without_initial_weights(recipe, init, SEMANTICKITTI, ("rv",), lines.append) is recipe
     assert not lines
 
     training = without_initial_weights(
@@ -322,8 +319,7 @@ def test_a_training_distils_what_one_of_its_datasets_lacks_and_says_so(
 def test_fine_tuning_keeps_the_sizes_and_can_be_repeated(world: Path, tmp_path: Path) -> None:
     # Without the broken sequence, so that all have labels.
     make_streets(tmp_path / "b", ("00",), 3)
-    command = arguments(world, tmp_path / "run", str(tmp_path / "b"))
-    succeed(*command, "--training.others", "0.4")
+    succeed(*arguments(world, tmp_path / "run", str(tmp_path / "b")), "--training.others", "0.4")
     start = load(world / "start.safetensors")
     trained = load(tmp_path / "run")
     assert trained.model == start.model
@@ -363,8 +359,7 @@ def test_scans_to_validate_with_are_not_mixed_in_under_another_name(tmp_path: Pa
 
 
 def test_scans_of_the_test_split_are_not_mixed_in_either(tmp_path: Path) -> None:
-    data = make_streets(tmp_path / "b", ("00", "08", "11"), 1)
-    first = open_dataset(str(data))
+    first = open_dataset(str(make_streets(tmp_path / "b", ("00", "08", "11"), 1)))
     same = Source(first, first.records(["11"]))
     with pytest.raises(InputError, match="apart from those to validate or to test with"):
         TrainingData([to_train(first), same])
@@ -411,8 +406,7 @@ def test_a_recipe_that_takes_the_model_of_init_refuses_another_one(tmp_path: Pat
 
 def test_any_classes_fit_a_recipe_that_takes_the_model_of_init(tmp_path: Path) -> None:
     """They get new last layers."""
-    data = open_dataset(str(make_streets(tmp_path, ("00", "08"), 1)))
-    scans = TrainingData([to_train(data)])
+    scans = TrainingData([to_train(open_dataset(str(make_streets(tmp_path, ("00", "08"), 1))))])
     init = fresh_weights(NUSCENES)
     Plan(sized_by_init(load_recipe("finetune"), init), scans, tmp_path / "run", init)
     with pytest.raises(InputError, match="use the recipe of that benchmark"):

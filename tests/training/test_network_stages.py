@@ -49,8 +49,7 @@ def plan_with(config: NetworkTraining) -> Plan:
 def polar_stage() -> PolarStage:
     torch.manual_seed(0)
     model = build_amvnet(MODEL_CONFIG, SEMANTICKITTI.size)
-    context = StageContext(CONFIG, SEMANTICKITTI)
-    return PolarStage(context, model.polar_view, model.polar_net.eval())
+    return PolarStage(StageContext(CONFIG, SEMANTICKITTI), model.polar_view, model.polar_net.eval())
 
 
 def batch_of_two() -> tuple[PointBatch, torch.Tensor]:
@@ -83,8 +82,7 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
 
         of_scan = voxels.scan == scan
         rows = voxels.logits[of_scan].tolist()
-        voxel_labels = voxels.labels[of_scan].tolist()
-        assert sorted(zip(rows, voxel_labels, strict=True)) == sorted(expected)
+        assert sorted(zip(rows, voxels.labels[of_scan].tolist(), strict=True)) == sorted(expected)
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
@@ -113,8 +111,7 @@ def test_a_voxel_with_points_of_two_datasets_has_the_first_as_its_source() -> No
 def test_on_a_cpu_all_convolutions_of_a_step_have_channels_last(stage: NetworkName) -> None:
     config = replace(MODEL_CONFIG, range_net=replace(MODEL_CONFIG.range_net, steps=True))
     plan = plan_with(CONFIG)
-    training = replace(plan.recipe.training, accelerator="cpu")
-    plan = replace(plan, recipe=Recipe(training=training))
+    plan = replace(plan, recipe=Recipe(training=replace(plan.recipe.training, accelerator="cpu")))
     made = make_stage(plan, stage, build_amvnet(config, 19))
     are_last: list[bool] = []
 
@@ -177,8 +174,7 @@ def test_only_datasets_with_points_of_a_class_lower_its_scores(stage: NetworkNam
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_a_stage_distils_its_initial_network_where_data_lack_a_class(stage: NetworkName) -> None:
-    config = replace(CONFIG, distill=2.0)
-    plan, model = plan_with(config), build_amvnet(MODEL_CONFIG, 19)
+    plan, model = plan_with(replace(CONFIG, distill=2.0)), build_amvnet(MODEL_CONFIG, 19)
     assert not make_stage(plan, stage, model).teachers
     made: Any = make_stage(plan, stage, model, None, RIVALS)
     made.log = lambda *_, **__: None

@@ -12,22 +12,8 @@ from amvnet.config.schema import Recipe
 from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.training_data import Source, TrainingData
 from amvnet.training.plan import Plan
-from amvnet.training.run_folder import (
-    LAST,
-    MAX_CHANGES,
-    RunFolder,
-    StageFolder,
-    describe_changes,
-)
-from amvnet.weights.file import (
-    DONE,
-    RECORD,
-    RUN_WEIGHTS,
-    SETTINGS,
-    load,
-    save,
-    unfinished_stages,
-)
+from amvnet.training.run_folder import LAST, MAX_CHANGES, RunFolder, StageFolder, describe_changes
+from amvnet.weights.file import DONE, RECORD, RUN_WEIGHTS, SETTINGS, load, save, unfinished_stages
 
 from fixtures.commands import fails, refused, succeed
 from fixtures.datasets import make_semantickitti
@@ -61,8 +47,7 @@ def test_settings_tell_classes_apart_by_names_order_and_ids(tmp_path: Path) -> N
         path = tmp_path / f"{len(found)}.yaml"
         path.write_text(yaml.safe_dump({"classes": classes, "scans": "*.bin"}, sort_keys=False))
         data = TrainingData([Source(open_own(path), [])])
-        settings = Plan(Recipe(), data, tmp_path / "run").settings("rv", fresh_weights())
-        found.add(settings["classes"])
+        found.add(Plan(Recipe(), data, tmp_path / "run").settings("rv", fresh_weights())["classes"])
     assert len(found) == 4
 
     # The ids of further datasets count, too.
@@ -82,8 +67,7 @@ def test_no_run_begins_in_the_folder_of_a_dataset(tmp_path: Path) -> None:
     own = open_own(tmp_path / "own.yaml")
     make_semantickitti(tmp_path / "kitti")
     for folder in (tmp_path, tmp_path / "x/..", tmp_path / "kitti"):
-        run = RunFolder(folder)
-        fails(partial(run.check_place, [own.root], []), folder, "a dataset")
+        fails(partial(RunFolder(folder).check_place, [own.root], []), folder, "a dataset")
     RunFolder(tmp_path / "run").check_place([own.root], [])
 
 

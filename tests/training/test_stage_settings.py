@@ -76,8 +76,7 @@ def test_the_loss_of_the_head_equals_its_formula() -> None:
     net = PointHead(PointHeadConfig(neighbours=4, hidden=(8, 8), fc=8), 19)
     points: Any = None  # the batch is given
     stage = HeadStage(StageContext(HeadTraining(epochs=1), SEMANTICKITTI), net, points, None)
-    trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
-    stage.trainer = trainer
+    stage.trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     stage.log = lambda *_, **options: None  # type: ignore[method-assign]
 
     torch.manual_seed(0)

@@ -282,8 +282,7 @@ def test_an_interrupted_run_resumes_to_the_same_weights(
     world: Path, run: Path, tmp_path: Path, stage: str, epoch: int
 ) -> None:
     train_interrupted(stage, epoch, world, tmp_path / "run")
-    resumed = train(world, tmp_path / "run", "--resume")
-    assert not differing(resumed, load(run))
+    assert not differing(train(world, tmp_path / "run", "--resume"), load(run))
     for name in ("best", "last"):
         path = f"{stage}/{name}.safetensors"
         assert not differing(load(tmp_path / "run" / path), load(run / path))
@@ -300,8 +299,7 @@ def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
     assert differing(load(last), load(run / "rv/last.safetensors")) == {"range_net"}
 
     # The training itself is that without the average.
-    losses = column(tmp_path / "whole", "rv", "train/loss")
-    assert losses == column(run, "rv", "train/loss")
+    assert column(tmp_path / "whole", "rv", "train/loss") == column(run, "rv", "train/loss")
     accuracies = column(tmp_path / "whole", "rv", "val/acc")
     assert accuracies != column(run, "rv", "val/acc")
 
@@ -321,8 +319,7 @@ def test_some_initial_weights_are_kept_and_resumed(world: Path, run: Path, tmp_p
     initial = load(init).part("polar_net")
     for name, tensor in kept.part("polar_net").items():
         if tensor.is_floating_point():
-            expected = 0.75 * trained[name] + 0.25 * initial[name]
-            torch.testing.assert_close(tensor, expected)
+            torch.testing.assert_close(tensor, 0.75 * trained[name] + 0.25 * initial[name])
     assert differing(load(tmp_path / "kept"), load(tmp_path / "trained")) == {"polar_net"}
 
     averaged = (*options, "--training.bev.initial", 0.25, "--training.bev.ema", 0.8)
@@ -377,8 +374,7 @@ def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
     others = ("--data", f"simulated-hdl64e:{tmp_path / 'other'}", "--training.workers", 1)
     train_interrupted("rv", 1, world, tmp_path / "cut", *options, *others)
     shutil.rmtree(tmp_path / "other")
-    resumed = train(world, tmp_path / "cut", *options, *others, "--resume")
-    assert not differing(resumed, whole)
+    assert not differing(train(world, tmp_path / "cut", *options, *others, "--resume"), whole)
 
     record = yaml.safe_load((tmp_path / "cut/run.yaml").read_text())["rv"]
     assert record["data"] == f"simulated-hdl64e:{tmp_path / 'other'}"
@@ -394,8 +390,7 @@ def test_tuning_weights_of_matched_intensities_matches_the_other_scans_too(
     save(matched, tmp_path / "init.safetensors")
 
     options = ("--stage", "rv", "--init", tmp_path / "init.safetensors")
-    tuned = train(world, tmp_path / "run", *options)
-    assert tuned.expects.intensity == matched.expects.intensity
+    assert train(world, tmp_path / "run", *options).expects.intensity == matched.expects.intensity
 
     # In training, the network is validated on what it gets in a prediction.
     figures = scored(world, tmp_path, tmp_path / "run", "--methods", "rv")["methods"]["rv"]
@@ -438,8 +433,7 @@ def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
 def test_a_broken_label_file_is_one_line_from_a_worker_too(world: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     shutil.copytree(world / "data", data)
-    label = data / "sequences/00/labels/000001.label"
-    np.full(499, CAR, np.uint32).tofile(label)  # of 500 points
+    np.full(499, CAR, np.uint32).tofile(data / "sequences/00/labels/000001.label")  # of 500 points
 
     options = ("--stage", "rv", "--training.rv.class_weights", 0, "--training.workers", 1)
     refused(

@@ -56,8 +56,7 @@ def test_only_points_in_the_box_are_drawn(page: Path, browser: Browser) -> None:
 
 @pytest.mark.parametrize("box", ["1,2,3", "a,b,c,d,e,f", "", "1,,,,,nan"])
 def test_a_box_that_is_none_hides_nothing(page: Path, browser: Browser, box: str) -> None:
-    state = browser.state(page, f"box={box}")
-    assert sum(state["drawn"]) == 2000
+    assert sum(browser.state(page, f"box={box}")["drawn"]) == 2000
 
 
 @pytest.mark.parametrize("ending", ["label", "npy", "txt", "bin"])
@@ -152,5 +151,4 @@ def test_pictures_and_tables_cause_no_error(page: Path, tmp_path: Path, browser:
 
 
 def test_an_error_of_the_page_is_noticed(page: Path, tmp_path: Path, browser: Browser) -> None:
-    state = browser.state(with_script(page, tmp_path / "p.html", "nothing()"))
-    assert len(state["console"]) == 1
+    assert len(browser.state(with_script(page, tmp_path / "p.html", "nothing()"))["console"]) == 1

@@ -60,8 +60,7 @@ def make_scan(
     points: np.ndarray, truth: np.ndarray | None = None, **labels: np.ndarray
 ) -> ShownScan:
     points = points.astype(np.float32)
-    valid = np.isfinite(points).all(axis=1)
-    return ShownScan("scan", points, valid, truth, labels)
+    return ShownScan("scan", points, np.isfinite(points).all(axis=1), truth, labels)
 
 
 def write_and_read(path: Path, *scans: ShownScan, title: str = "title") -> Page:
@@ -136,8 +135,7 @@ def test_the_page_has_all_probabilities_and_the_disagreement(
 
 def test_the_page_is_as_sure_as_the_result(dataset: SemanticKitti, world: Path) -> None:
     """Also of points to which both networks together give no score."""
-    segmenter = amvnet.load(world / "w.safetensors")
-    result = segmenter(dataset.read(dataset.records(["00"])[0]))
+    result = amvnet.load(world / "w.safetensors")(dataset.read(dataset.records(["00"])[0]))
     scores = result.scores.copy()
     scores[:5] = 0
     result = replace(result, scores=scores)
@@ -176,8 +174,7 @@ def test_the_page_names_classes_and_colours_officially(path: Path) -> None:
 
 def test_points_without_a_place_are_left_out_and_counted(tmp_path: Path) -> None:
     points = np.array([[1, 2, 3, 0.5], [np.nan, 0, 0, 0], [4, 5, 6, 2.0], [0, 0, 501, 0]])
-    shown = make_scan(points, labels=np.array([1, 2, 3, 4]))
-    page = write_and_read(tmp_path / "p.html", shown)
+    page = write_and_read(tmp_path / "p.html", make_scan(points, labels=np.array([1, 2, 3, 4])))
     xyz, planes = page.scan(0)
 
     np.testing.assert_allclose(xyz, points[[0, 2], :3], atol=1e-4)
@@ -364,8 +361,7 @@ def test_a_file_shows_its_labels_only_in_its_own_classes(world: Path, tmp_path: 
     ply = tmp_path / "lone.ply"
     refused(("view", ply, "--taxonomy", "nuscenes"), ply, "classes of nuscenes", "semantickitti")
 
-    without_comments = re.sub(rb"comment [^\n]*\n", b"", ply.read_bytes())
-    ply.write_bytes(without_comments)
+    ply.write_bytes(re.sub(rb"comment [^\n]*\n", b"", ply.read_bytes()))
     assert view_page(tmp_path, ply).about["sources"] == []
 
 
@@ -441,14 +437,9 @@ def test_nuscenes_is_shown_with_its_truth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("count", "chosen"), [(1, ["00/000000"]), (2, ["00/000000", "08/000001"])])
 def test_scans_are_chosen_evenly(
-    world: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    count: int,
-    chosen: list[str],
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int, chosen: list[str]
 ) -> None:
-    page = view_page(tmp_path, world / "data", "--scans", count)
-    assert scan_names(page) == chosen
+    assert scan_names(view_page(tmp_path, world / "data", "--scans", count)) == chosen
     assert f"{count} of 6 scans in" in capsys.readouterr().out
 
 
@@ -565,8 +556,7 @@ def test_a_click_on_a_class_hides_it(path: Path, tmp_path: Path, browser: Browse
 @pytest.mark.full
 def test_the_picture_shows_what_is_asked_for_at_its_place(tmp_path: Path, browser: Browser) -> None:
     """From above, x up and y to the left: cars left, green right, wrong labels at the bottom."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform((-15, -15, -0.1, 0), (15, 15, 0.1, 1), (20_000, 4))
+    points = np.random.default_rng(0).uniform((-15, -15, -0.1, 0), (15, 15, 0.1, 1), (20_000, 4))
     truth = np.where(points[:, 1] > 0, 1, 15)
     labels = np.where(points[:, 0] > 0, truth, 13)
     path = tmp_path / "p.html"

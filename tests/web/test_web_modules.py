@@ -82,8 +82,7 @@ class Case:
         view = expected.view
         rows = self.rows or view.rows
         # Coarse images have hidden points.
-        width = view.width // 8
-        view = dataclasses.replace(view, rows=rows, width=width, hidden=0.02, nearest=6)
+        view = dataclasses.replace(view, rows=rows, width=view.width // 8, hidden=0.02, nearest=6)
         intensity = self.intensity or expected.intensity
         sensor = dataclasses.replace(expected.sensor, **self.sensor)
         return dataclasses.replace(expected, view=view, intensity=intensity, sensor=sensor)
@@ -258,8 +257,7 @@ def of_half_the_lasers(folder: Path) -> Case:
 
 def with_dead_lasers(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
-    is_alive = laser % 3 != 1
-    return of_hdl32e(folder, with_ring(points, 31 - laser)[is_alive], "laser")
+    return of_hdl32e(folder, with_ring(points, 31 - laser)[laser % 3 != 1], "laser")
 
 
 def with_raised_lasers(first: int, steps: int, folder: Path) -> Case:
@@ -446,8 +444,7 @@ def on_a_bank(folder: Path) -> Case:
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-25, 25, (2, 20_000))
     z = 0.2 * y - 2.5 + rng.uniform(0.2, 2, len(x)) * (rng.random(len(x)) < 0.85)
-    points = np.column_stack([x, y, z, rng.random(len(x))])
-    return Case(write_bin(folder / "bank.bin", points))
+    return Case(write_bin(folder / "bank.bin", np.column_stack([x, y, z, rng.random(len(x))])))
 
 
 def under_a_plane(below: float, folder: Path) -> Case:
@@ -470,8 +467,7 @@ def between_walls(folder: Path) -> Case:
 
 def of_one_elevation(folder: Path) -> Case:
     """All points lie on a line outside the field of view of the weights' sensor."""
-    radius = np.linspace(2, 20, 200)
-    np.save(folder / "line.npy", np.outer(radius, [1, 0, 1, 0.02]))
+    np.save(folder / "line.npy", np.outer(np.linspace(2, 20, 200), [1, 0, 1, 0.02]))
     return Case(folder / "line.npy")
 
 
@@ -507,8 +503,7 @@ def with_odd_intensities(folder: Path) -> Case:
 
 
 def of_missing_intensities(folder: Path) -> Case:
-    case = bright(folder)
-    points = np.fromfile(case.file, np.float32).reshape(-1, 4)
+    points = np.fromfile(bright(folder).file, np.float32).reshape(-1, 4)
     points[::2, 3] = np.nan
     points[1, 3] = np.nan
     return Case(write_bin(folder / "missing.bin", points))
@@ -652,16 +647,14 @@ def test_neighbours_are_as_near_as_the_packages(name: str, made: Callable[[str],
 def test_few_points_are_repeated_as_neighbours(count: int, tmp_path: Path) -> None:
     points = some_points(200)
     points[count:] = np.nan
-    case = Case(write_bin(tmp_path / "few.bin", points))
-    (page,) = run_page([case], tmp_path)
+    (page,) = run_page([Case(write_bin(tmp_path / "few.bin", points))], tmp_path)
     expected = nearest_others(points[:count, :3], np.array([0]), NEIGHBOURS)
     assert np.array_equal(page["neighbours"], expected[0])
 
 
 @pytest.mark.parametrize("lead", [0.0, 1.5, 3.0])
 def test_disputed_points_are_those_of_the_onnx_runner(lead: float, tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    f, g = rng.dirichlet(np.full(K, 0.3), (2, 2000)).astype(np.float32)
+    f, g = np.random.default_rng(5).dirichlet(np.full(K, 0.3), (2, 2000)).astype(np.float32)
     config = AssertionConfig(lead=lead)
     uncertain = onnx_runner.disagree(config, f, g)
     expected = np.flatnonzero(onnx_runner.disputed_points(config, f, g, uncertain))
@@ -773,8 +766,7 @@ def test_a_flag_before_the_coordinates_is_passed_over(tmp_path: Path) -> None:
     flagged = b"".join(b"1 " + row for row in rows.splitlines(keepends=True))
     (tmp_path / "flagged.ply").write_bytes(header + b"end_header\n" + flagged)
 
-    cases = [Case(tmp_path / "plain.ply"), Case(tmp_path / "flagged.ply")]
-    plain, page = run_page(cases, tmp_path)
+    plain, page = run_page([Case(tmp_path / "plain.ply"), Case(tmp_path / "flagged.ply")], tmp_path)
     assert np.array_equal(page["points"], plain["points"])
 
 
@@ -829,20 +821,18 @@ def test_arrays_of_any_type_and_order_are_read(tmp_path: Path) -> None:
 
 def test_other_arrays_are_refused_in_one_line(tmp_path: Path) -> None:
     points = some_points(3000)
-    labels = np.arange(3000) % 7 * 1000
     arrays = {
         "transposed": points.T,
         "transposed_image": np.moveaxis(points.reshape(50, 60, 4), -1, 0),
         "image": points.reshape(50, 60, 4),
         "fields": points.view([(name, "f4") for name in "xyzi"]),
         "text": np.array(["a", "b"]),
-        "labels": np.column_stack((points, labels)),
+        "labels": np.column_stack((points, np.arange(3000) % 7 * 1000)),
         "half": points.astype(np.float16),
     }
     for name, array in arrays.items():
         np.save(tmp_path / f"{name}.npy", array)
-    pickled = np.array([{}, None], object)
-    np.save(tmp_path / "pickled.npy", pickled, allow_pickle=True)
+    np.save(tmp_path / "pickled.npy", np.array([{}, None], object), allow_pickle=True)
     whole = (tmp_path / "labels.npy").read_bytes()
     (tmp_path / "cut.npy").write_bytes(whole[:-5])
     (tmp_path / "header.npy").write_bytes(whole[:60])
@@ -921,8 +911,7 @@ OWN_WORDS = ("found a broken file", "expected a scan of at most")
 
 def test_a_broken_file_gives_the_line_of_the_command(tmp_path: Path) -> None:
     paths = broken_files(tmp_path)
-    results = run_page([Case(path) for path in paths], tmp_path)
-    for path, page in zip(paths, results, strict=True):
+    for path, page in zip(paths, run_page([Case(path) for path in paths], tmp_path), strict=True):
         assert "error" in page, path.name
         with pytest.raises(InputError) as caught:
             normalised(Case(path))

@@ -108,8 +108,7 @@ def served(folder: Path, headers: dict[str, str]) -> Iterator[Site]:
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
     site.url = f"http://127.0.0.1:{server.server_port}/try/"
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
+    threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         yield site
     finally:
@@ -315,8 +314,7 @@ def test_a_broken_file_gives_its_line(session: Session) -> None:
 
 
 def test_hostile_names_of_files_stay_names(session: Session) -> None:
-    result = session.results["own"]
-    assert result["assumed"].startswith(f"{HOSTILE}.bin: assumed")
+    assert session.results["own"]["assumed"].startswith(f"{HOSTILE}.bin: assumed")
     assert session.report["console"] == []  # an image that is missing would be an error there
 
 

@@ -305,8 +305,7 @@ def test_a_card_abridges_what_is_long_or_deep() -> None:
     for level in range(400):
         deep = {"a": deep} if level % 2 else [deep]
     record = {"deep": deep, "many": list(range(10**5)), "ends": ["x" * 10**6] * 20}
-    weights = replace(fresh_weights(), training={"range_net": record})
-    text = model_card(weights, "w")
+    text = model_card(replace(fresh_weights(), training={"range_net": record}), "w")
     assert "[0, 1, 2, " in text
     assert "..." in text
     assert len(text) < 10_000

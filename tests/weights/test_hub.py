@@ -61,15 +61,13 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
 
 
 def test_pushed_weights_can_be_loaded(hub: Hub) -> None:
-    address = amvnet.push(WEIGHTS, NAME, private=True)
-    assert address == "https://hub/somebody/streets/commit/1"
+    assert amvnet.push(WEIGHTS, NAME, private=True) == "https://hub/somebody/streets/commit/1"
     assert hub.calls[0] == {"repo_id": "somebody/streets", "private": True}
     folder = hub.root / "somebody/streets"
     assert sorted(path.name for path in folder.iterdir()) == ["README.md", "model.safetensors"]
 
     pushed = amvnet.load(WEIGHTS)
-    loaded = amvnet.load(NAME)
-    assert np.array_equal(loaded(POINTS).labels, pushed(POINTS).labels)
+    assert np.array_equal(amvnet.load(NAME)(POINTS).labels, pushed(POINTS).labels)
 
 
 @pytest.mark.parametrize("file", ["model.safetensors", "README.md"])
@@ -129,8 +127,7 @@ def test_the_commands_take_names_of_the_hub(
 
 def test_the_card_says_what_the_hub_and_people_need(hub: Hub) -> None:
     amvnet.push(WEIGHTS, NAME, licence="cc-by-nc-sa-4.0")
-    text = (hub.root / "somebody/streets/README.md").read_text()
-    _, front_matter, card = text.split("---\n", 2)
+    _, front_matter, card = (hub.root / "somebody/streets/README.md").read_text().split("---\n", 2)
 
     metadata = yaml.safe_load(front_matter)
     assert metadata["license"] == "cc-by-nc-sa-4.0"
@@ -160,8 +157,7 @@ def test_a_card_without_a_licence_says_so() -> None:
 )
 def test_the_code_of_the_card_runs(dropped: tuple[str, ...], tmp_path: Path) -> None:
     path = save(without(WEIGHTS, *dropped), tmp_path / "w.safetensors")
-    card = model_card(load(path), str(path))
-    code = card.split("```python\n")[1].split("```")[0]
+    code = model_card(load(path), str(path)).split("```python\n")[1].split("```")[0]
 
     scores = np.full((len(POINTS), 19), 1 / 19, np.float32)
     names: dict[str, Any] = {"points": POINTS, "f": scores, "g": scores}

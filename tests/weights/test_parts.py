@@ -59,8 +59,7 @@ def test_networks_and_head_of_two_files_add_up(weights: Weights) -> None:
     assert networks.parts == ("range_net", "polar_net")
     assert head.parts == ("point_head",)
 
-    whole = replace_part(networks, "point_head", head)
-    assert np.array_equal(scores(whole), scores(weights))
+    assert np.array_equal(scores(replace_part(networks, "point_head", head)), scores(weights))
 
 
 @pytest.mark.parametrize("part", PARTS)

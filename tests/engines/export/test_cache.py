@@ -71,8 +71,7 @@ def exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Exports:
 def cached(weights: Weights = WEIGHTS, int8: bool = False) -> tuple[dict[str, bytes], str]:
     """Return the contents of the graphs, and what is said."""
     said: list[str] = []
-    networks = cached_networks(weights, int8, said.append)
-    return dict(networks.files), "\n".join(said)
+    return dict(cached_networks(weights, int8, said.append).files), "\n".join(said)
 
 
 def filled(weights: Weights = WEIGHTS) -> Path:
@@ -173,8 +172,7 @@ def test_a_cache_that_another_user_can_write_is_not_used_and_that_is_said(
     place: str, mode: int, exports: Exports, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cache, "_is_group_of_one", lambda gid: False)
-    folder = filled()
-    changed = (folder / place).resolve()
+    changed = (filled() / place).resolve()
     before = stat.S_IMODE(changed.stat().st_mode)
     changed.chmod(before | mode)
     exports.content = b"another graph"
@@ -292,8 +290,7 @@ def test_concurrent_exports_into_one_cache_all_succeed_and_leave_one_whole(
 
     assert len(results) == workers
     for networks in results:
-        suffixes = {content.split()[1] for content in networks.values()}
-        assert len(suffixes) == 1
+        assert len({content.split()[1] for content in networks.values()}) == 1
     kept, said = cached()
     assert not said
     assert kept in results
@@ -335,8 +332,7 @@ def test_weights_of_one_network_have_one_graph(
 
     def export(weights: Weights, out: Path, scans: Sequence[Scan]) -> None:
         exports(weights, out)
-        text = (out / DESCRIPTION).read_text()
-        description: dict[str, Any] = json.loads(text) | {"method": "rv"}
+        description: dict[str, Any] = json.loads((out / DESCRIPTION).read_text()) | {"method": "rv"}
         description["graphs"] = {RANGE_NET: description["graphs"][RANGE_NET]}
         (out / DESCRIPTION).write_text(json.dumps(description))
 
@@ -356,5 +352,4 @@ def test_a_changed_graph_changes_no_label(tmp_path: Path, monkeypatch: pytest.Mo
     first, second = sorted((tmp_path / "onnx").iterdir())
     (first / "range_net.onnx").write_bytes((second / "range_net.onnx").read_bytes())
     (second / "polar_map.onnx").write_bytes((first / "polar_map.onnx").read_bytes()[:1000])
-    actual = amvnet.load(WEIGHTS, engine="onnx")(points)
-    assert np.array_equal(actual.scores, expected.scores)
+    assert np.array_equal(amvnet.load(WEIGHTS, engine="onnx")(points).scores, expected.scores)

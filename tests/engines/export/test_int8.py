@@ -138,8 +138,7 @@ def test_convolutions_hold_integers_nearest_to_their_weights(exported: Folders, 
         assert np.abs(kernel.weights.astype(int)).max() <= 64  # seven bits
         assert kernel.scale.shape == weights.shape[:1]
         steps = kernel.scale.reshape(-1, 1, 1, 1)
-        errors = np.abs(kernel.weights * steps - weights)
-        assert (errors <= 0.5001 * steps + 1e-7).all()
+        assert (np.abs(kernel.weights * steps - weights) <= 0.5001 * steps + 1e-7).all()
     assert in_float32 == (["stem.0.weight"] if name == "range_net" else [])
 
 
@@ -195,8 +194,7 @@ def test_one_scan_and_rows_by_ring_do(scans: Path, tmp_path: Path) -> None:
     succeed(f"export --weights {path} --out {tmp_path}/out --int8 {scans}/000003.bin")
 
     points = read_points(scans / "000003.bin")
-    segmenter = OnnxSegmenter(tmp_path / "out")
-    assert segmenter(points, rings_of(points, 16)).labels.all()
+    assert OnnxSegmenter(tmp_path / "out")(points, rings_of(points, 16)).labels.all()
 
 
 # ---- mistakes

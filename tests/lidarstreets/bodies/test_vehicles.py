@@ -35,8 +35,7 @@ MAKERS: dict[Maker, tuple[Label, Limits, Limits, Limits]] = {
 
 
 def size_of(mesh: Mesh) -> np.ndarray:
-    corners = mesh.triangles.reshape(-1, 3)
-    size: np.ndarray = np.ptp(corners, axis=0)
+    size: np.ndarray = np.ptp(mesh.triangles.reshape(-1, 3), axis=0)
     return size
 
 
@@ -79,8 +78,7 @@ def test_a_semi_trailer_stands_behind_its_truck() -> None:
 @pytest.mark.parametrize("maker", [cars.car, trucks.truck, people.person])
 def test_bodies_of_one_kind_differ(maker: Maker) -> None:
     rng = np.random.default_rng(0)
-    sizes = np.array([size_of(maker(rng)) for _ in range(30)])
-    assert len(np.unique(sizes.round(4), axis=0)) == 30
+    assert len(np.unique(np.array([size_of(maker(rng)) for _ in range(30)]).round(4), axis=0)) == 30
 
 
 def test_people_of_a_group_stand_close_together() -> None:

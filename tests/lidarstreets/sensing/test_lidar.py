@@ -128,8 +128,7 @@ def test_flat_ground_has_the_ranges_of_the_textbook(ground: Points) -> None:
     assert abs(error.mean()) < 0.001
 
     # Relief is no deeper than a fraction of the noise if it is seen from above.
-    near = distance < 6
-    assert error[near].std() == pytest.approx(HDL64E.range_noise, rel=0.05)
+    assert error[distance < 6].std() == pytest.approx(HDL64E.range_noise, rel=0.05)
 
 
 @pytest.mark.full
@@ -212,8 +211,7 @@ def test_the_car_hides_what_is_behind_its_parts(ground: Points) -> None:
 
 @pytest.mark.parametrize(("mixed", "smallest", "largest"), [(0.0, 0, 0), (0.5, 11, np.inf)])
 def test_some_returns_at_edges_lie_in_between(mixed: float, smallest: int, largest: int) -> None:
-    walls = join(wall(10, (1, 9)), wall(12, (-9, 9)))
-    points, _, _ = scan_mesh(walls, replace(EXACT, mixed=mixed))
+    points, _, _ = scan_mesh(join(wall(10, (1, 9)), wall(12, (-9, 9))), replace(EXACT, mixed=mixed))
     between = np.count_nonzero((points[:, 0] > 10.05) & (points[:, 0] < 11.95))
     assert smallest <= between <= largest
 
@@ -292,8 +290,7 @@ def test_foliage_has_gaps_and_dense_places() -> None:
 def test_a_hull_is_closed_and_faces_outwards() -> None:
     centre = (1, 2, 3)
     for seed in range(20):
-        rng = np.random.default_rng(seed)
-        triangles = hull(rng, centre, (2, 1, 4), taper=0.7, square=0.6)
+        triangles = hull(np.random.default_rng(seed), centre, (2, 1, 4), taper=0.7, square=0.6)
 
         edges = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)]).round(6) + 0.0
         forward = {edge.tobytes() for edge in edges}
@@ -440,8 +437,7 @@ def test_the_shots_that_the_car_blocks_return_from_its_roof() -> None:
 
     distance = np.linalg.norm(points[:, :3], axis=1)
     is_roof = (distance > 1) & (distance < 3)  # lost returns are nearer, and the wall is farther
-    blocked = lidar.rays_of(sensor, blocked=True)
-    assert np.array_equal(np.sort(ring[is_roof]), np.sort(blocked.ring))
+    assert np.array_equal(np.sort(ring[is_roof]), np.sort(lidar.rays_of(sensor, blocked=True).ring))
     x, y, z = points[is_roof, :3].T
     np.testing.assert_allclose(z, -0.5, atol=0.1)
     assert np.degrees(np.arctan2(-z, np.hypot(x, y))).min() > 12

@@ -159,8 +159,7 @@ def test_a_corner_is_rounded() -> None:
 def test_strips_are_laid_from_the_kerb_outwards() -> None:
     strips = (Strip(1.0, Label.TERRAIN), Strip(2.0, Label.SIDEWALK))
     label, off = strip_at(strips, np.array([0.5, 1.5, 2.9, 3.1]), Label.OTHER_GROUND)
-    expected = [Label.TERRAIN, Label.SIDEWALK, Label.SIDEWALK, Label.OTHER_GROUND]
-    assert label.tolist() == expected
+    assert label.tolist() == [Label.TERRAIN, Label.SIDEWALK, Label.SIDEWALK, Label.OTHER_GROUND]
     assert off == pytest.approx([-2.5, -1.5, -0.1, 0.1])
 
 
@@ -175,8 +174,7 @@ def test_a_side_road_is_where_its_poses_are(bend: float) -> None:
 def test_an_island_has_round_ends() -> None:
     island = Island((0, 10), (-1, 1), Label.TERRAIN)
     along = np.array([5.0, 0.0, 0.1, -1.0])
-    t = np.array([0.0, 0.0, 0.9, 0.0])
-    distance = island.distance(along, t)
+    distance = island.distance(along, np.array([0.0, 0.0, 0.9, 0.0]))
     assert distance[:2] == pytest.approx([-1, 0])
     assert distance[2] > 0
     assert distance[3] == pytest.approx(1)
