@@ -89,10 +89,7 @@ def test_a_folder_lists_all_of_them(folder: Path) -> None:
     # Text files are scans of a folder only if there are no others.
     assert paths == [folder / name for name in sorted(WRITERS) if name != "plain.xyz"]
 
-    names = set()
-    for path in paths:
-        for scan in list_scans(path):
-            names.add(scan.name)
+    names = {scan.name for path in paths for scan in list_scans(path)}
     assert {"nuscenes", "plain/000000", "lone/000000"} <= names
 
 

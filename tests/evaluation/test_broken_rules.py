@@ -81,10 +81,7 @@ NUSCENES = {
     "uint32": Fault(changed(uint8_as_uint32), "of 32 bits; write", official=True),
 }
 FAULTS = {"semantickitti": BOTH | SEMANTICKITTI, "nuscenes": BOTH | NUSCENES}
-BROKEN = []
-for _benchmark, _faults in FAULTS.items():
-    for _name in _faults:
-        BROKEN.append((_benchmark, _name))
+BROKEN = [(_benchmark, _name) for _benchmark, _faults in FAULTS.items() for _name in _faults]
 
 
 @pytest.mark.parametrize(("layout", "name"), BROKEN)

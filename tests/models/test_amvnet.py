@@ -182,10 +182,10 @@ def head_features_by_loop(
     point = [*f[own].tolist(), *g[own].tolist(), x * scale, y * scale, z * scale, intensity]
 
     nearest, _ = neighbours_by_loop(points, own)
-    rows = []
-    for k in nearest[: TINY.point_head.neighbours]:
-        offset = (points[k] - points[own]).tolist()
-        rows.append([*f[k].tolist(), *g[k].tolist(), *offset])
+    rows = [
+        [*f[k].tolist(), *g[k].tolist(), *(points[k] - points[own]).tolist()]
+        for k in nearest[: TINY.point_head.neighbours]
+    ]
     return point, rows
 
 

@@ -399,10 +399,10 @@ def test_scans_in_another_unit_are_fused_as_those_in_metres(
     start: Start, drive: Drive, unit: str, factor: float
 ) -> None:
     scale = np.array([factor, factor, factor, 1], np.float32)
-    messages = []
-    for index, (points, _) in enumerate(drive_scans(DRIVE_SCANS)):
-        message = cloud(FIRST + PERIOD * index, points * scale).make(STORE)
-        messages.append(as_rclpy_gives_it(message))
+    messages = [
+        as_rclpy_gives_it(cloud(FIRST + PERIOD * index, points * scale).make(STORE))
+        for index, (points, _) in enumerate(drive_scans(DRIVE_SCANS))
+    ]
     found = []
     for sent, stated in ((messages, unit), (drive.messages, "m")):
         found.append(np.concatenate(label_all(fusing(start, drive, unit=stated), sent)))

@@ -211,10 +211,10 @@ def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_f
 
 
 def test_own_scans_are_brought_to_the_initial_weights_first(tmp_path: Path, own_file: Path) -> None:
-    by_height = {}
-    for height in (1.0, 2.0):
-        expects = Expectation(sensor=Sensor(height=height))
-        by_height[height] = replace(fresh_weights(), expects=expects)
+    by_height = {
+        height: replace(fresh_weights(), expects=Expectation(sensor=Sensor(height=height)))
+        for height in (1.0, 2.0)
+    }
     recipe = sized_by_init(load_recipe("finetune"), by_height[2.0])
 
     def target(init: Weights | None) -> float | None:

@@ -226,10 +226,10 @@ def test_validation_scans_are_read_like_training_scans_and_not_augmented() -> No
     view = replace(MODEL_CONFIG.range_view, rows="laser")
     recipe = Recipe(model=replace(MODEL_CONFIG, range_view=view))
     dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
-    records = []
-    for name in ("a", "b"):
-        path = Path(f"{name}.bin")
-        records.append(ScanFile(name, Recording("00"), path, prediction=f"{name}.label"))
+    records = [
+        ScanFile(name, Recording("00"), Path(f"{name}.bin"), prediction=f"{name}.label")
+        for name in ("a", "b")
+    ]
     expects = Expectation(view)
     data = TrainingData([Source(dataset, records[:1], records[1:])])
     train, val = make_loaders(Plan(recipe, data, Path("run")), CONFIG, expects)
