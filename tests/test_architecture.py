@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from fixtures.commands import not_none
+
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src"
 PAGE = (ROOT / "docs/architecture.md").read_text()
@@ -55,8 +57,7 @@ def imported(node: ast.AST) -> Iterator[str]:
 
 def levels() -> dict[str, int]:
     """Return the level of each package in the drawing of the page; 0 is the lowest."""
-    drawing = re.search(r"## Import direction.*?```text\n(.*?)```", PAGE, re.S)
-    assert drawing is not None
+    drawing = not_none(re.search(r"## Import direction.*?```text\n(.*?)```", PAGE, re.S))
     heights = {}
     for level, line in enumerate(reversed(drawing[1].splitlines())):
         for name in line.split():
@@ -108,8 +109,7 @@ def test_the_simulator_knows_nothing_of_the_method() -> None:
 
 
 def test_the_page_lists_all_packages() -> None:
-    table = re.search(r"## Packages\n(.*?)\n\nNext to", PAGE, re.S)
-    assert table is not None
+    table = not_none(re.search(r"## Packages\n(.*?)\n\nNext to", PAGE, re.S))
     rows = re.findall(r"^\| (.+?) \| (.+) \|$", table[1], re.M)[1:]
     packages = {name.strip("`") for name, _ in rows[:-1]}
     singles = set(re.findall(r"`(\w+)`", rows[-1][1]))

@@ -25,7 +25,7 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import read_page
-from fixtures.commands import fails, files, succeed
+from fixtures.commands import fails, files, not_none, succeed
 from fixtures.scan_writers import write_bag1, write_pcd
 from fixtures.tiny import fresh_weights, make_streets, street, without
 
@@ -141,8 +141,7 @@ def test_a_scan_of_a_dataset_keeps_its_labels(tmp_path: Path, segmenter: Segment
     data = make_streets(tmp_path, ("00",))
     fails(lambda: segmenter(data), "one scan", "Segmenter.each")
     first = next(segmenter.each(data))
-    assert first.origin is not None
-    assert first.origin.scan.labels is not None
+    assert not_none(first.origin).scan.labels is not None
     assert first.assumed == ""
 
 

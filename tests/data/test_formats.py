@@ -32,7 +32,7 @@ from amvnet.data.labels.readers import read_raw_labels
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.scan_writers import (
     FLOATS,
     WRITERS,
@@ -551,9 +551,7 @@ def test_a_dimension_of_las_with_rings_is_read(tmp_path: Path) -> None:
     las["ring"] = np.arange(60) % 16
     las.write(str(tmp_path / "a.las"))
 
-    ring = read_cloud(tmp_path / "a.las").ring
-    assert ring is not None
-    assert ring.tolist() == list(np.arange(60) % 16)
+    assert not_none(read_cloud(tmp_path / "a.las").ring).tolist() == list(np.arange(60) % 16)
 
 
 # --- bags ---

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.poses import read_poses, times_of
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.drives import TO_CAMERA, drive_poses, write_drive
 from fixtures.tiny import GOLDEN
 
@@ -106,9 +106,7 @@ def test_a_calibration_turns_no_other_format(tmp_path: Path) -> None:
 def test_poses_of_the_camera_become_poses_of_the_lidar(tmp_path: Path) -> None:
     dataset = open_dataset(str(write_drive(tmp_path)))
     records = dataset.records(["00"])
-    poses = dataset.poses(records)
-    assert poses is not None
-    np.testing.assert_allclose(poses, drive_poses(), atol=1e-9)
+    np.testing.assert_allclose(not_none(dataset.poses(records)), drive_poses(), atol=1e-9)
     file = tmp_path / "sequences/00/poses.txt"
     assert "turned from the camera by calib.txt" in read_poses(file).note
     (tmp_path / "sequences/00/calib.txt").rename(tmp_path / "calib.txt")
@@ -116,9 +114,7 @@ def test_poses_of_the_camera_become_poses_of_the_lidar(tmp_path: Path) -> None:
     (tmp_path / "calib.txt").rename(tmp_path / "sequences/00/calib.txt")
 
     # The number of a scan is the line of its pose.
-    some = dataset.poses(records[3:5])
-    assert some is not None
-    np.testing.assert_allclose(some, drive_poses()[3:5], atol=1e-9)
+    np.testing.assert_allclose(not_none(dataset.poses(records[3:5])), drive_poses()[3:5], atol=1e-9)
 
 
 def test_a_dataset_without_poses_has_none(tmp_path: Path) -> None:
@@ -131,8 +127,7 @@ def test_poses_of_nuscenes_are_those_of_the_car_and_of_its_sensor() -> None:
     """The reference turns a point by each quaternion, which the tables round."""
     dataset = open_dataset(str(GOLDEN / "nuscenes"))
     records = dataset.records(dataset.sequences("all"))
-    poses = dataset.poses(records)
-    assert poses is not None
+    poses = not_none(dataset.poses(records))
     tables = {}
     for name in ("sample_data", "ego_pose", "calibrated_sensor"):
         rows = json.loads((GOLDEN / f"nuscenes/v1.0-mini/{name}.json").read_text())

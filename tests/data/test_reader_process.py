@@ -19,7 +19,7 @@ from amvnet import read as read_scan
 from amvnet.data.formats import reader_process
 from amvnet.data.formats.find import list_scans
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.scan_writers import some_points, write_bag2, write_las
 from fixtures.waiting import wait_for_end
 
@@ -32,8 +32,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def process_id() -> int:
-    assert reader_process._process is not None
-    return reader_process._process._popen.pid
+    return not_none(reader_process._process)._popen.pid
 
 
 def test_one_process_serves_all_files_and_threads(bag: Path, tmp_path: Path) -> None:
@@ -120,13 +119,11 @@ def test_the_process_ends_with_the_one_that_started_it(tmp_path: Path, ends: str
         stdout=subprocess.PIPE,
         text=True,
     ) as parent:
-        assert parent.stdin is not None
-        assert parent.stdout is not None
-        number, folder = parent.stdout.readline().split()
+        number, folder = not_none(parent.stdout).readline().split()
         if ends == "by SIGKILL":
             parent.kill()
         else:
-            parent.stdin.close()
+            not_none(parent.stdin).close()
 
     wait_for_end(int(number))
     if ends == "by itself":

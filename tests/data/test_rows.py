@@ -15,7 +15,7 @@ from amvnet.data.formats.find import find_scans, list_scans, read_cloud
 from amvnet.data.formats.rows import NAMES, RowLayout, are_rings, name_columns, parse_layout
 from amvnet.data.formats.text import find_table
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.growth import takes_linear_time
 from fixtures.sensors import LASERS, place
 
@@ -236,8 +236,7 @@ def text_of(table: np.ndarray, separator: str = ",") -> str:
 def check_text(path: Path, table: np.ndarray) -> None:
     cloud = read_cloud(path)
     np.testing.assert_allclose(cloud.xyz, table[:, :3], atol=0.0006)
-    assert cloud.intensity is not None
-    np.testing.assert_allclose(cloud.intensity, table[:, 3], atol=0.0006)
+    np.testing.assert_allclose(not_none(cloud.intensity), table[:, 3], atol=0.0006)
     np.testing.assert_array_equal(cloud.ring, table[:, 4])
 
 

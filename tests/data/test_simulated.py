@@ -26,7 +26,7 @@ from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, drive_street, simulate, writing
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.tiny import fake_drive
 
 BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES, "vlp32c": SEMANTICKITTI}
@@ -75,8 +75,7 @@ def test_a_scan_equals_that_of_the_files_of_a_simulation(
             if not is_real:
                 continue
             # The order of the points in the files of SemanticKITTI tells their rings.
-            lasers = KNOWN_SENSORS[sensor].beams
-            assert lasers is not None
+            lasers = not_none(KNOWN_SENSORS[sensor].beams)
             other = replace(other, ring=lasers_by_order(other.points, lasers))
         assert scan.ring is not None
         assert other.ring is not None

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from amvnet.drives.odometry import Pair, check_fit, check_steps
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.drives import drive_poses
 
 NAMED = ("poses", "advice")  # the beginning and the end of a message
@@ -107,14 +107,12 @@ def test_the_fit_says_how_exact_poses_are(seed: int) -> None:
     """The alignment finds the true motion, of which poses are off by metres and degrees."""
     motion = motion_of(metres=3)
     pair = Pair(posts(seed=seed), moved_back(posts(seed=seed), motion), motion)
-    fit = check_fit([pair], *NAMED)
-    assert fit is not None
+    fit = not_none(check_fit([pair], *NAMED))
     assert fit.distance == pytest.approx(0, abs=1e-9) == fit.shift
     assert not fit.is_doubtful
 
     wrong = replace(pair, motion=motion @ motion_of(degrees=0.6))
-    fit = check_fit([wrong], *NAMED)
-    assert fit is not None
+    fit = not_none(check_fit([wrong], *NAMED))
     assert fit.is_doubtful
     assert fit.least == pytest.approx(0, abs=0.01)
     reach = np.median(np.linalg.norm(posts(seed=seed), axis=1))

@@ -30,7 +30,7 @@ from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.commands import files, refused, succeed
+from fixtures.commands import files, not_none, refused, succeed
 from fixtures.tiny import (
     fresh_weights,
     make_streets,
@@ -75,9 +75,8 @@ def figures_of(dataset: Dataset, weights: Weights) -> tuple[float, dict[str, Any
     uncertain = []
     for record in dataset.records(["08"]):
         scan = dataset.read(record)
-        assert scan.labels is not None
         result = segmenter(scan)
-        matrix += confusion(scan.labels, result.labels, K)
+        matrix += confusion(not_none(scan.labels), result.labels, K)
         uncertain.append(result.uncertain)
     return float(np.concatenate(uncertain).mean()), metrics(matrix, dataset.taxonomy)
 

@@ -14,7 +14,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.evaluation.metrics import Evaluation, confusion, metrics
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -27,9 +27,8 @@ def golden_report(name: str, predictions: str) -> dict[str, Any]:
     evaluation = Evaluation(dataset.taxonomy)
     for record in dataset.records(dataset.sequences("val")):
         scan = dataset.read(record)
-        assert scan.labels is not None
         prediction = dataset.read_prediction(record, GOLDEN / name / predictions)
-        evaluation.add(scan.points, scan.labels, {"predictions": prediction})
+        evaluation.add(scan.points, not_none(scan.labels), {"predictions": prediction})
 
     return evaluation.report(name)
 

@@ -30,7 +30,7 @@ from amvnet.evaluation.label_errors import (
 )
 from amvnet.weights.file import save
 
-from fixtures.commands import files, refused, run_cli
+from fixtures.commands import files, not_none, refused, run_cli
 from fixtures.engines import giving, scripted
 from fixtures.tiny import fresh_weights, make_streets, without
 
@@ -235,11 +235,10 @@ def test_the_table_says_what_the_scans_hold(world: Path) -> None:
     names = ("", *SEMANTICKITTI.classes)
     for row in clusters[:20]:
         scan = dataset.read(records[row["scan"]])
-        assert scan.labels is not None
         point = int(row["point"])
         xyz = (float(row["x"]), float(row["y"]), float(row["z"]))
         assert np.allclose(xyz, scan.points[point, :3], atol=0.006)
-        assert row["label"] == names[scan.labels[point]] != ""
+        assert row["label"] == names[not_none(scan.labels)[point]] != ""
 
 
 def test_scans_without_labels_are_refused(world: Path, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import save
 
 from fixtures.bag_poses import drive_clouds, drive_odometry, odometry, pose_at, write_bag
-from fixtures.commands import contents, fails, files, refused, run_cli, succeed
+from fixtures.commands import contents, fails, files, not_none, refused, run_cli, succeed
 from fixtures.drives import HEIGHT, SCANS, drive_poses, drive_scans, write_drive
 from fixtures.tiny import fresh_weights
 
@@ -341,8 +341,7 @@ def test_poses_of_own_scans_move_the_points_of_files(world: Path, tmp_path: Path
         found = loaded.points[:, :3] @ into_world[:3, :3].T + into_world[:3, 3]
         np.testing.assert_allclose(found, points[:, :3] @ pose[:3, :3].T + pose[:3, 3], atol=1e-3)
 
-    part = scans[5].dataset.poses(scans[5:7])
-    assert part is not None
+    part = not_none(scans[5].dataset.poses(scans[5:7]))
     np.testing.assert_allclose(part[:, :3].reshape(-1, 12), kitti[5:7], atol=1e-12)
 
 

@@ -19,7 +19,7 @@ from amvnet.evaluation.scoring import labels_by_method
 from amvnet.models.methods import METHODS, MethodName
 from amvnet.weights.file import Weights, save
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.sensors import rings_of
 from fixtures.tiny import THRESHOLD, fresh_weights, street, with_model, without
 
@@ -44,9 +44,7 @@ def labels_by(method: MethodName, points: np.ndarray = POINTS) -> np.ndarray:
 
 
 def both_networks(result: Segmentation) -> tuple[np.ndarray, np.ndarray]:
-    assert result.rv is not None
-    assert result.bev is not None
-    return result.rv, result.bev
+    return not_none(result.rv), not_none(result.bev)
 
 
 def equal_probabilities() -> np.ndarray:
@@ -374,8 +372,7 @@ def test_the_rows_of_a_scan_take_precedence_over_its_elevations_and_rings() -> N
         height = weights.model.range_view.height
         ring = rings_of(POINTS, height)
         others = ring // 2
-        by_ring = segmenter_by_ring(weights)(Scan(POINTS, ring=ring)).scores
-        assert by_ring is not None
+        by_ring = not_none(segmenter_by_ring(weights)(Scan(POINTS, ring=ring)).scores)
 
         by_row = segmenter(Scan(POINTS, ring=others, row=height - 1 - ring)).scores
         assert np.array_equal(by_row, by_ring)
@@ -431,8 +428,7 @@ def test_agreement_needs_no_head(result: Segmentation) -> None:
 
 
 def test_fusing_leaves_the_callers_head_as_it_was() -> None:
-    head = WEIGHTS.build().point_head
-    assert head is not None
+    head = not_none(WEIGHTS.build().point_head)
     head.train()
     f = equal_probabilities()
     fuse(POINTS, f, f, head=head)

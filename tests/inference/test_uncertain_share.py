@@ -15,7 +15,7 @@ from amvnet.inference.predict import ADVICE
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 from amvnet.weights.verdict import Verdict
 
-from fixtures.commands import run_cli
+from fixtures.commands import not_none, run_cli
 from fixtures.tiny import fresh_weights, street, with_model, without
 
 POINTS = street(5, 400)[0]
@@ -72,8 +72,7 @@ def test_labels_of_another_tau_are_not_judged_by_the_share_usual_for_the_weights
     tau = weights.model.assertion.threshold
     assert amvnet.load(weights, tau=tau)(POINTS).verdict == amvnet.load(weights)(POINTS).verdict
 
-    verdict = amvnet.load(weights, tau=1.0)(POINTS).verdict
-    assert verdict is not None
+    verdict = not_none(amvnet.load(weights, tau=1.0)(POINTS).verdict)
     assert verdict.share == 1
     assert not verdict.is_doubtful
     assert str(verdict) == "100.0% of the points are uncertain"
@@ -91,14 +90,12 @@ def test_a_result_has_the_share_of_its_valid_points() -> None:
 def test_one_network_is_judged_by_its_mean_entropy(method: Any) -> None:
     points = np.concatenate([POINTS, np.full((100, 4), np.nan, np.float32)])
     result = amvnet.load(fresh_weights(), method=method)(points)
-    network = result.bev if method == "bev" else result.rv
-    assert network is not None
+    network = not_none(result.bev if method == "bev" else result.rv)
     classes = network.shape[1]
     entropies = []
     for row in network[: len(POINTS)].tolist():
         entropies.append(sum(-p * math.log(p, classes) for p in row if p > 0))
-    verdict = result.verdict
-    assert verdict is not None
+    verdict = not_none(result.verdict)
     assert verdict.share == pytest.approx(np.mean(entropies), abs=1e-6)
     assert verdict.is_doubtful  # the network has learnt nothing
     assert "entropy" in str(verdict)

@@ -21,7 +21,7 @@ from lidarstreets import LIDAR_MODELS, SimulatedScan, SimulationError, simulate
 from lidarstreets.sensing.any_sensor import LASERS, MAX_SHOTS, draw_sensor
 from lidarstreets.sensing.sensors import LidarModel, draw_device
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.tiny import make_simulation_quick
 
 pytest.importorskip("embreex")
@@ -71,8 +71,7 @@ def test_a_simulated_scan_has_the_lasers_and_the_height_of_its_sensor(name: str)
     for laser in seen:
         assert abs(np.median(elevation[ring == laser]) - device.elevations[::-1][laser]) < 0.6
 
-    ground = find_ground(points[:, :3].astype(np.float64))
-    assert ground is not None
+    ground = not_none(find_ground(points[:, :3].astype(np.float64)))
     assert ground.height == pytest.approx(device.height, abs=0.12)
     assert device.height == pytest.approx(LIDAR_MODELS[name].height, abs=0.3)
 
@@ -132,11 +131,9 @@ def test_streets_of_any_sensor_are_normalised_for_networks(tmp_path: Path) -> No
     seed = np.random.SeedSequence((64, 12))
     for record, simulated in zip(records, drive_street(ANY, 6, seed), strict=True):
         scan = dataset.read(record)
-        assert scan.row is not None
-        assert scan.row.max() <= expected.view.height - 1
+        assert not_none(scan.row).max() <= expected.view.height - 1
         assert len(scan) == len(simulated.points)
-        ground = find_ground(scan.points[scan.valid, :3].astype(np.float64))
-        assert ground is not None
+        ground = not_none(find_ground(scan.points[scan.valid, :3].astype(np.float64)))
         assert ground.height == pytest.approx(1.73, abs=0.3)
 
 

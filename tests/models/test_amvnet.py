@@ -29,6 +29,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid
 from amvnet.scan import Scan
 
+from fixtures.commands import not_none
 from fixtures.networks import GRID, TINY, K, trained_head, whole_model
 
 RandomScan = Callable[..., Scan]
@@ -225,13 +226,11 @@ def test_points_of_a_cube_get_the_scores_of_its_first_disputed_point(edge: float
     f, g = (torch.cat([values, values[:70].flip(0)]) for values in (f, g))
     disputed = torch.arange(270) % 3 > 0
     model = whole_model().eval()
-    assert model.point_head is not None
-    h = model.refine(batch, f, g, disputed)
-    assert h is not None
+    h = not_none(model.refine(batch, f, g, disputed))
     every = torch.zeros_like(f)
     every[disputed] = h
 
-    model.point_head.config = replace(TINY.point_head, cell=edge)
+    not_none(model.point_head).config = replace(TINY.point_head, cell=edge)
     shared = model.refine(batch, f, g, disputed)
     first: dict[tuple[int, ...], int] = {}
     expected = []

@@ -9,6 +9,8 @@ from torch.nn import functional as F
 from amvnet.models import cpu_convolution
 from amvnet.models.layers import RingConv2d
 
+from fixtures.commands import not_none
+
 SHAPES = [
     pytest.param(5, 7, (3, 3), (1, 1), (1, 0), id="3 x 3"),
     pytest.param(5, 7, (3, 3), (2, 2), (1, 0), id="strided"),
@@ -38,8 +40,7 @@ def test_the_gradient_of_the_weights_is_that_of_autograd(
 
     gradient = cpu_convolution.weight_gradient(x, grad, kernel, stride, padding)
 
-    assert weight.grad is not None
-    torch.testing.assert_close(gradient, weight.grad)
+    torch.testing.assert_close(gradient, not_none(weight.grad))
 
 
 def test_a_layer_learns_the_same_on_both_kinds_of_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,9 +54,7 @@ def test_a_layer_learns_the_same_on_both_kinds_of_cpus(monkeypatch: pytest.Monke
         x = torch.arange(6 * 8 * 16.0).sin().view(1, 6, 8, 16).requires_grad_()
         layer.zero_grad()
         layer(x).square().sum().backward()
-        assert x.grad is not None
-        assert layer.weight.grad is not None
-        gradients.append((x.grad, layer.weight.grad))
+        gradients.append((not_none(x.grad), not_none(layer.weight.grad)))
 
     for by_products, by_torch in zip(*gradients, strict=True):
         torch.testing.assert_close(by_products, by_torch)

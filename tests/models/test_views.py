@@ -20,6 +20,8 @@ from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeImage, RangeView
 from amvnet.scan import Scan
 
+from fixtures.commands import not_none
+
 RandomScan = Callable[..., Scan]
 
 SPHERICAL = RangeViewConfig(height=16, width=250, fov_up=10.0, fov_down=-20.0)
@@ -74,8 +76,7 @@ def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[
         degrees = math.degrees(math.atan2(z, math.sqrt(x * x + y * y)))
         row = cell_of((c.fov_up - degrees) / (c.fov_up - c.fov_down), c.height)
         if c.rows == "ring" or (c.rows == "laser" and scan.ring is not None):
-            assert scan.ring is not None
-            row = c.height - 1 - int(scan.ring[i])
+            row = c.height - 1 - int(not_none(scan.ring)[i])
         if scan.row is not None and scan.row[i] >= 0:
             row = int(scan.row[i])
         column = cell_of((math.pi - math.atan2(y, x)) / (2 * math.pi), c.width)
@@ -290,8 +291,7 @@ def test_a_ring_out_of_range_or_none_is_an_input_error(ring: int) -> None:
 def test_rows_and_lasers_are_taken_where_they_are_known(rows: Any, random_scan: RandomScan) -> None:
     config = replace(BY_RING, rows=rows)
     scan = random_scan(400)
-    assert scan.ring is not None
-    assert scan.ring.max() < config.height
+    assert not_none(scan.ring).max() < config.height
     assert_equals_the_loop(scan, config)
 
     row = np.random.default_rng(0).integers(0, config.height, len(scan))
@@ -413,20 +413,15 @@ def test_a_point_batch_leaves_lost_points_out(random_scan: RandomScan, lost: flo
     valid = [0, 1, 3, 4, 6, 7, 8]
     batch = PointBatch.of([scan])
     assert batch.points.tolist() == scan.points[valid].tolist()
-    assert batch.ring is not None
-    assert scan.ring is not None
-    assert batch.ring.tolist() == scan.ring[valid].tolist()
+    assert not_none(batch.ring).tolist() == not_none(scan.ring)[valid].tolist()
 
 
 def test_rings_and_rows_that_a_scan_of_a_batch_lacks_are_minus_one(random_scan: RandomScan) -> None:
     scan = random_scan(4)
-    assert scan.ring is not None
     without = replace(scan, ring=None)
     batch = PointBatch.of([scan, without, replace(without, row=np.arange(4))])
-    assert batch.ring is not None
-    assert batch.row is not None
-    assert batch.ring.tolist() == [*scan.ring.tolist(), *[-1] * 8]
-    assert batch.row.tolist() == [*[-1] * 8, 0, 1, 2, 3]
+    assert not_none(batch.ring).tolist() == [*not_none(scan.ring).tolist(), *[-1] * 8]
+    assert not_none(batch.row).tolist() == [*[-1] * 8, 0, 1, 2, 3]
     assert PointBatch.of([without]).ring is None
     assert PointBatch.of([scan]).row is None
 

@@ -37,7 +37,7 @@ from fixtures.bag_poses import (
     pose_at,
     write_bag,
 )
-from fixtures.commands import succeed
+from fixtures.commands import not_none, succeed
 from fixtures.drives import drive_scans
 from fixtures.processes import PATIENCE
 from fixtures.ros import STORE, install, over_the_wire
@@ -178,8 +178,7 @@ def test_the_diagnostics_have_the_verdict_of_other_entries(
     start: Start, weights: Path, tmp_path: Path, method: Any
 ) -> None:
     np.save(tmp_path / "scan.npy", scan(0))
-    verdict = amvnet.load(weights, method=method)(tmp_path / "scan.npy").verdict
-    assert verdict is not None
+    verdict = not_none(amvnet.load(weights, method=method)(tmp_path / "scan.npy").verdict)
 
     node = start(method=method)
     send(node, ros_message(scan(0)))

@@ -15,7 +15,7 @@ from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lidars import AXES, UNKNOWN_SENSOR, Sensor, rotation_from_degrees
 from amvnet.sensors.normalise import Normaliser
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.examples import first_of
 from fixtures.sensors import LASERS, between_bent_walls, place
 from fixtures.tiny import fresh_weights, trained_for
@@ -47,9 +47,7 @@ def normalise(xyz: np.ndarray, sensor: Sensor = UNKNOWN_SENSOR) -> tuple[Scan, s
 
 def assert_alike(scan: Scan, expected: Scan, atol: float) -> None:
     np.testing.assert_allclose(scan.points, expected.points, atol=atol)
-    assert scan.row is not None
-    assert expected.row is not None
-    assert np.abs(scan.row - expected.row).max() <= 1
+    assert np.abs(not_none(scan.row) - not_none(expected.row)).max() <= 1
 
 
 @pytest.mark.parametrize("axes", UP)
@@ -69,8 +67,7 @@ def test_axes_and_millimetres_are_recognised_and_said(axes: str, unit: float) ->
 def test_a_tilted_scan_is_levelled(tilt: tuple[float, float], axes: str) -> None:
     xyz = scan_xyz()
     scan, line = normalise(in_axes(tilted(xyz, *tilt), axes))
-    ground = find_ground(scan.points[:, :3].astype(np.float64))
-    assert ground is not None
+    ground = not_none(find_ground(scan.points[:, :3].astype(np.float64)))
     assert ground.tilt < 0.3
     assert ground.height == pytest.approx(1.73, abs=0.1)
     np.testing.assert_allclose(scan.points[:, 2], xyz[:, 2], atol=0.15)

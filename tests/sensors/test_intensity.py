@@ -34,7 +34,7 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.training.expectation import expectation_of
 from amvnet.weights.file import Weights
 
-from fixtures.commands import fails
+from fixtures.commands import fails, not_none
 from fixtures.sensors import LASERS, ground_height, place
 from fixtures.tiny import (
     fresh_weights,
@@ -329,5 +329,4 @@ def test_scans_that_sway_have_the_intensities_of_their_recording() -> None:
     assert is_usual
     assert recording.usual is not None
     assert not recording.usual.is_steady
-    assert estimate.quantiles is not None
-    np.testing.assert_array_equal(estimate.quantiles, recording.usual.quantiles)
+    np.testing.assert_array_equal(not_none(estimate.quantiles), recording.usual.quantiles)

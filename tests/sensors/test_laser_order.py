@@ -14,6 +14,8 @@ from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.lasers import lasers_by_order, order_rings
 from amvnet.sensors.lidars import rotation_from_degrees
 
+from fixtures.commands import not_none
+
 LASERS = 16
 SHOTS = 200
 
@@ -36,9 +38,7 @@ def turns(seed: int = 0, lasers: int = LASERS) -> tuple[np.ndarray, np.ndarray]:
 def test_the_order_of_the_points_gives_their_lasers(seed: int) -> None:
     points, ring = turns(seed)
     kept = np.random.default_rng(seed).random(len(points)) < 0.8  # weak returns are missing
-    found = lasers_by_order(points[kept], LASERS)
-    assert found is not None
-    assert np.array_equal(found, ring[kept])
+    assert np.array_equal(not_none(lasers_by_order(points[kept], LASERS)), ring[kept])
 
 
 def test_lost_returns_have_the_laser_of_the_point_before() -> None:
@@ -48,8 +48,7 @@ def test_lost_returns_have_the_laser_of_the_point_before() -> None:
     for value in (0.0, np.nan, np.inf):
         changed = points.copy()
         changed[lost, :3] = value
-        found = lasers_by_order(changed, LASERS)
-        assert found is not None
+        found = not_none(lasers_by_order(changed, LASERS))
         assert np.array_equal(found[~lost], ring[~lost])
         assert found.min() >= 0
         assert found.max() < LASERS
@@ -87,9 +86,7 @@ def test_known_rings_stay() -> None:
     expects = Expectation(RangeViewConfig(rows="laser", height=LASERS))
     assert expects.prepare(Scan(points, ring=ring)).ring is ring
     assert Expectation().prepare(Scan(points)).ring is None
-    found = expects.prepare(Scan(points)).ring
-    assert found is not None
-    assert np.array_equal(found, ring)
+    assert np.array_equal(not_none(expects.prepare(Scan(points)).ring), ring)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 15.0])
@@ -127,8 +124,7 @@ def test_a_laser_that_sees_only_the_car_has_its_place(near: int) -> None:
     points[is_near, :2] = 0
     for ring in (LASERS - 1 - laser, other[laser]):
         scan, _ = order_rings(Scan(points, ring=ring))
-        assert scan.ring is not None
-        assert sorted(set(scan.ring.tolist())) == list(range(LASERS))
+        assert sorted(set(not_none(scan.ring).tolist())) == list(range(LASERS))
 
 
 def test_the_lowest_laser_is_the_last_ring_although_the_highest_see_nothing() -> None:

@@ -16,7 +16,7 @@ from amvnet.errors import InputError
 from amvnet.sensors.lidars import KNOWN_BODIES, Sensor, make_sensor
 from amvnet.sensors.own_body import Body, find_body, is_inside, measure_body
 
-from fixtures.commands import succeed
+from fixtures.commands import not_none, succeed
 
 BODY = (-2.0, -0.8, -1.0, 1.0, 0.8, -0.5)  # in the axes of the package
 HEIGHT = 1.7
@@ -58,8 +58,7 @@ def found(scans: list[np.ndarray], **sensor: Any) -> Body | None:
 
 def test_the_box_of_the_body_is_measured_and_its_share_of_the_points() -> None:
     scans = drive()
-    body = found(scans)
-    assert body is not None
+    body = not_none(found(scans))
     np.testing.assert_allclose(body.box, BODY, atol=0.11)
     assert body.share == pytest.approx(is_inside(np.concatenate(scans), body.box).mean())
     assert np.array(body.box).tolist() == np.round(body.box, 1).tolist()
@@ -76,8 +75,7 @@ def test_the_box_of_the_body_is_measured_and_its_share_of_the_points() -> None:
     ],
 )
 def test_the_box_is_in_metres_and_the_files_axes(change: Any, sensor: dict[str, Any]) -> None:
-    body = found([change(xyz) for xyz in drive()], **sensor)
-    assert body is not None
+    body = not_none(found([change(xyz) for xyz in drive()], **sensor))
     unit = 1000 if change(np.eye(3))[0, 0] == 1000 else 1
     corners = change(np.array([BODY[:3], BODY[3:]])) / unit
     np.testing.assert_allclose(body.box[:3], corners.min(axis=0), atol=0.11)
@@ -101,9 +99,7 @@ def test_nothing_is_said_of_scans_that_show_no_body(scans: list[np.ndarray]) -> 
 
 
 def test_a_wall_along_the_way_is_not_of_the_body() -> None:
-    body = found(drive(wall=1.5))
-    assert body is not None
-    np.testing.assert_allclose(body.box, BODY, atol=0.11)
+    np.testing.assert_allclose(not_none(found(drive(wall=1.5))).box, BODY, atol=0.11)
 
 
 @pytest.mark.parametrize("sensor", [{"own_body": BODY}, {"keep_own": True}])
@@ -145,8 +141,7 @@ def test_the_known_body_of_nuscenes_car_is_measured_in_each_scene() -> None:
     for scene in dataset.sequences("all"):
         records = dataset.records([scene])[::4]
         clouds = [Cloud(dataset.read(record, labels=False).points[:, :3]) for record in records]
-        body = find_body(clouds, Sensor())
-        assert body is not None
+        body = not_none(find_body(clouds, Sensor()))
         points = np.concatenate([cloud.xyz for cloud in clouds])
         known = is_inside(points, KNOWN_BODIES["hdl32e"])
         measured = is_inside(points, body.box)

@@ -22,7 +22,7 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.sensors.own_body import mark_own, own_points
 from amvnet.weights.file import save
 
-from fixtures.commands import fails, succeed
+from fixtures.commands import fails, not_none, succeed
 from fixtures.sensors import LASERS, is_on_nuscenes_car, on_nuscenes_car, place
 from fixtures.tiny import fresh_weights
 
@@ -62,8 +62,7 @@ def test_near_points_are_the_bodys_if_many_and_of_its_lasers(share: float, senso
 
 def test_lost_returns_hide_no_body_and_twice_as_many_rings_show_another_sensor() -> None:
     points, laser = on_nuscenes_car()
-    expected = own_points(points, laser, Sensor())
-    assert expected is not None
+    expected = not_none(own_points(points, laser, Sensor()))
     lost = np.arange(len(points)) % 50 == 0
     points[lost, :3] = np.nan
     for ring in (laser, None):
@@ -87,8 +86,7 @@ def test_the_body_that_a_scan_states_stays() -> None:
 
 def test_a_stated_body_counts_for_any_sensor() -> None:
     points, laser = place(LASERS["vlp16"], 0.9)
-    own = own_points(points, laser, Sensor(own_body=BOX))
-    assert own is not None
+    own = not_none(own_points(points, laser, Sensor(own_body=BOX)))
     expected = [-1 <= x <= 14 and -2 <= y <= 5 and -0.5 <= z <= 0.6 for x, y, z, _ in points]
     assert own.tolist() == expected
     assert 0 < own.sum() < len(own)
@@ -144,8 +142,7 @@ def test_nearly_all_points_that_nuscenes_calls_its_car_are_found_and_hardly_othe
     of_others = Counter[str]()
     for record in dataset.records(dataset.sequences("all"))[::10]:
         scan = dataset.read(record)
-        own = own_points(scan.points, scan.ring, Sensor())
-        assert own is not None
+        own = not_none(own_points(scan.points, scan.ring, Sensor()))
         raw = dataset.raw_labels(record, len(scan))
         of_body.update(names[index] for index in raw[own].tolist())
         of_others.update(names[index] for index in raw[~own].tolist())

@@ -44,7 +44,7 @@ from amvnet.sensors.rows import _row_view
 from amvnet.weights.file import built_in, load, save
 from lidarstreets import LIDAR_MODELS
 
-from fixtures.commands import fails, files, refusal, run_cli
+from fixtures.commands import fails, files, not_none, refusal, run_cli
 from fixtures.datasets import make_nuscenes
 from fixtures.examples import first_of, with_examples
 from fixtures.scan_writers import pcd_bytes, write_bag1
@@ -88,9 +88,7 @@ def test_the_ground_is_the_lower_plane_even_if_more_cells_show_the_tops_of_hedge
     x, y = rng.uniform(-18, 18, (2, 20_000))
     is_hedge = (np.floor(x / 2) + np.floor(y / 2)) % 5 < 3
     z = np.where(is_hedge, -0.6, -1.7) + rng.normal(0, 0.01, len(x))
-    ground = find_ground(np.column_stack([x, y, z]))
-    assert ground is not None
-    assert ground.height == pytest.approx(1.7, abs=0.05)
+    assert not_none(find_ground(np.column_stack([x, y, z]))).height == pytest.approx(1.7, abs=0.05)
 
 
 def test_what_a_scan_does_not_tell_stays_unknown() -> None:
@@ -112,9 +110,8 @@ def test_real_sensors_have_the_height_that_is_known(name: str, model: str) -> No
         scan = dataset.read(record, labels=False)
         geometry = measure(scan.points[scan.valid], scan.ring)
         assert geometry.beams == (None if scan.ring is None else 32)
-        assert geometry.height is not None
 
-        heights.append(geometry.height)
+        heights.append(not_none(geometry.height))
 
     expected = KNOWN_HEIGHTS[model]
     assert np.median(heights) == pytest.approx(expected, abs=0.1)
@@ -139,9 +136,9 @@ def make_cloud(points: np.ndarray, ring: np.ndarray | None = None) -> Cloud:
 
 def assert_alike(a: Scan, b: Scan, atol: float = 1e-4) -> None:
     np.testing.assert_allclose(a.points, b.points, atol=atol)
-    assert a.row is not None
-    assert b.row is not None
-    assert np.mean(a.row == b.row) > 0.99  # all but points at the border of two rows
+    assert (
+        np.mean(not_none(a.row) == not_none(b.row)) > 0.99
+    )  # all but points at the border of two rows
 
 
 @pytest.mark.parametrize("height", [0.6, 1.73, 2.6])
@@ -237,8 +234,7 @@ def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
 def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None:
     points, laser = place(LASERS["os1-64"], 0.8)
     recording, _ = make_recording()
-    row = recording.to_scan(make_cloud(points)).row
-    assert row is not None
+    row = not_none(recording.to_scan(make_cloud(points)).row)
 
     rows = []
     for index in range(64):
@@ -254,8 +250,7 @@ def test_rows_by_elevation_reach_half_a_row_beyond_the_lasers() -> None:
     points, _ = place(np.linspace(-20, 20, 64), 1.7)
     view = RangeViewConfig(height=16, width=64, fov_up=3, fov_down=-25)
     lasers = SensorGeometry(64, fov_up=20.0, fov_down=-20.0)
-    chosen = _row_view(points, lasers, Expectation(view, Sensor()))
-    assert chosen is not None
+    chosen = not_none(_row_view(points, lasers, Expectation(view, Sensor())))
     half = 40 / 16 / 2
     assert (chosen.fov_up, chosen.fov_down) == (20 + half, -20 - half)
 
@@ -284,8 +279,7 @@ def test_points_whose_ring_is_unknown_get_no_row_by_their_ring() -> None:
     points, laser = place(np.linspace(-20, 12, 32), 1.84)
     unknown = np.arange(len(laser)) % 7 == 0
     recording, _ = make_recording(Sensor(beams=32), "homemade", is_nuscenes=True)
-    row = recording.to_scan(make_cloud(points, np.where(unknown, -1, laser))).row
-    assert row is not None
+    row = not_none(recording.to_scan(make_cloud(points, np.where(unknown, -1, laser))).row)
     np.testing.assert_array_equal(row, np.where(unknown, -1, 31 - laser))
 
 
@@ -647,8 +641,7 @@ def test_scans_of_a_benchmark_are_normalised_for_weights_that_do_not_know_its_se
         {scan.path: scan for scan in each.records(layout.sequences)}[layout.first_points].load(True)
         for each in (dataset, changed)
     )
-    assert unchanged.labels is not None
-    np.testing.assert_array_equal(scan.labels, np.where(scan.valid, unchanged.labels, 0))
+    np.testing.assert_array_equal(scan.labels, np.where(scan.valid, not_none(unchanged.labels), 0))
     assert (scan.row is not None) == is_changed
     if is_changed:
         cloud = Cloud(

@@ -26,7 +26,7 @@ from amvnet.training.adapt import (
 )
 from amvnet.weights.file import load, save
 
-from fixtures.commands import refused, run_cli, succeed
+from fixtures.commands import not_none, refused, run_cli, succeed
 from fixtures.drives import drive_poses, drive_scans, write_drive
 from fixtures.tiny import fresh_weights
 
@@ -94,9 +94,7 @@ def test_points_teach_of_which_the_consensus_is_sure(world: Path) -> None:
     assert figures["consistency"] == pytest.approx(agreeing / valid)
     both = 0
     for result in results:
-        assert result.rv is not None
-        assert result.bev is not None
-        is_same = result.rv.argmax(axis=1) == result.bev.argmax(axis=1)
+        is_same = not_none(result.rv).argmax(axis=1) == not_none(result.bev).argmax(axis=1)
         both += int(np.count_nonzero(is_same & (result.labels > 0)))
     assert figures["agreement"] == pytest.approx(both / valid)
     assert LEAST_PROBABILITY == 0.6

@@ -21,6 +21,8 @@ from amvnet.training.augment import (
     tilt_rotation,
 )
 
+from fixtures.commands import not_none
+
 RandomScan = Callable[..., Scan]
 OFF = AugmentConfig(scale=0.0, flip=0.0, jitter=0.0, yaw=0.0)
 
@@ -118,8 +120,6 @@ def test_labels_intensity_ring_name_and_lost_returns_stay(random_scan: RandomSca
 
 def test_points_are_dropped_together_with_their_labels_and_rings(random_scan: RandomScan) -> None:
     scan = random_scan(1000)
-    assert scan.labels is not None
-    assert scan.ring is not None
 
     index_of = index_by_point(scan)
     shares = []
@@ -127,10 +127,8 @@ def test_points_are_dropped_together_with_their_labels_and_rings(random_scan: Ra
         changed = augmented(scan, replace(OFF, drop=0.4), seed)
         indices = [index_of[tuple(row)] for row in changed.points.tolist()]
         assert indices == sorted(indices)
-        assert changed.labels is not None
-        assert changed.ring is not None
-        assert np.array_equal(changed.labels, scan.labels[indices])
-        assert np.array_equal(changed.ring, scan.ring[indices])
+        assert np.array_equal(not_none(changed.labels), not_none(scan.labels)[indices])
+        assert np.array_equal(not_none(changed.ring), not_none(scan.ring)[indices])
         shares.append(1 - len(changed) / len(scan))
 
     assert min(shares) < 0.1
@@ -263,10 +261,9 @@ def test_objects_are_pasted_at_their_place_turned_once_or_twice(random_scan: Ran
         assert not np.allclose(added[1], added[0])
 
         assert pasted.labels is not None
-        assert pasted.ring is not None
         times = len(added)
         assert np.array_equal(pasted.labels[len(scan) :], np.tile(other.labels[is_object], times))
-        assert len(pasted.ring) == len(pasted)
+        assert len(not_none(pasted.ring)) == len(pasted)
 
     assert copies == {1, 2}
 
@@ -369,8 +366,7 @@ def test_whole_lasers_are_dropped_every_second_or_at_random(random_scan: RandomS
     shares = []
     for seed in range(60):
         changed = augmented(scan, replace(OFF, laser_drop=1.0), seed)
-        assert changed.ring is not None
-        rings = set(changed.ring.tolist())
+        rings = set(not_none(changed.ring).tolist())
         assert len(changed) == np.isin(scan.ring, list(rings)).sum()
 
         is_every_second = rings in halves
@@ -460,10 +456,8 @@ def from_other_scan(mixed: Scan, scan: Scan, other: Scan) -> np.ndarray:
             index = index_in_scan[point]
         is_foreign.append(source is other)
 
-        assert source.labels is not None
-        assert source.ring is not None
-        assert label == source.labels[index]
-        assert ring == source.ring[index]
+        assert label == not_none(source.labels)[index]
+        assert ring == not_none(source.ring)[index]
     return np.array(is_foreign)
 
 

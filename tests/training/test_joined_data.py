@@ -35,7 +35,7 @@ from amvnet.training.losses import rival_classes
 from amvnet.training.plan import Plan, open_for_training, sized_by_init, without_initial_weights
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.commands import fails, refusal, refused, run_cli, succeed
+from fixtures.commands import fails, not_none, refusal, refused, run_cli, succeed
 from fixtures.own_scans import make_own_scans
 from fixtures.tiny import (
     BUILDING,
@@ -115,9 +115,7 @@ def test_the_check_finds_others_classes(tmp_path: Path, monkeypatch: pytest.Monk
     car = SEMANTICKITTI.classes.index("car")
     assert taught[1, car]
     assert not taught[0, car]
-    rivals = rival_classes(taught)
-    assert rivals is not None
-    assert np.argwhere(~rivals).tolist() == [[0, car]]
+    assert np.argwhere(~not_none(rival_classes(taught))).tolist() == [[0, car]]
     # A line of the check names the dataset that it is about.
     assert all(line.startswith((f"{a.spec}: ", f"{b.spec}: ")) for line in lines)
 
@@ -221,8 +219,7 @@ def test_own_scans_are_brought_to_the_initial_weights_first(tmp_path: Path, own_
         dataset = open_for_training(str(own_file), recipe, tmp_path / "run", init)
         assert isinstance(dataset, OwnScans)
         assert isinstance(dataset.normalise, Normaliser)
-        assert dataset.normalise.expected is not None
-        return dataset.normalise.expected.sensor.height
+        return not_none(dataset.normalise.expected).sensor.height
 
     save(by_height[1.0], tmp_path / "run/weights.safetensors")
     assert target(None) == 1.0

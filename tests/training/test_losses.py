@@ -23,6 +23,8 @@ from amvnet.training.losses import (
     rival_classes,
 )
 
+from fixtures.commands import not_none
+
 K = 5
 LOSSES = pytest.mark.parametrize("region_loss", [dice, lovasz_softmax])
 
@@ -154,8 +156,7 @@ def test_a_batchs_loss_and_gradient_are_the_means_over_its_scans(region_loss: Re
 
 def test_a_class_that_one_dataset_lacks_has_no_rivals_there() -> None:
     present = np.array([[1, 0, 0, 1], [1, 1, 0, 0]], bool)
-    rivals = rival_classes(present)
-    assert rivals is not None
+    rivals = not_none(rival_classes(present))
     # No dataset has the third class, so that all points count against it.
     assert rivals.tolist() == [[True, False, True, True], [True, True, True, False]]
     assert rival_classes(present[:1]) is None
@@ -312,8 +313,7 @@ def test_if_all_is_ignored_loss_and_gradient_are_zero(region_loss: RegionLoss, p
     value = loss_of(region_loss, logits, torch.zeros(points, dtype=torch.uint8), torch.ones(K), 1.0)
     value.backward()
     assert value.item() == 0
-    assert logits.grad is not None
-    assert torch.equal(logits.grad, torch.zeros(points, K))
+    assert torch.equal(not_none(logits.grad), torch.zeros(points, K))
 
 
 @LOSSES
@@ -321,8 +321,7 @@ def test_for_extreme_logits_the_gradient_of_the_loss_is_finite(region_loss: Regi
     logits, labels = example()
     logits = (logits * 1000).requires_grad_()
     loss_of(region_loss, logits, labels.to(torch.uint8), None, 1.0).backward()
-    assert logits.grad is not None
-    assert logits.grad.isfinite().all()
+    assert not_none(logits.grad).isfinite().all()
 
 
 @pytest.mark.parametrize("power", [0.5, 0.4])

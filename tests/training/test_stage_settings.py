@@ -24,7 +24,7 @@ from amvnet.training.networks import NetworkStage
 from amvnet.training.stage import StageContext
 from amvnet.weights.file import save
 
-from fixtures.commands import run_cli
+from fixtures.commands import not_none, run_cli
 from fixtures.tiny import fresh_weights, make_streets, write_recipe
 
 
@@ -65,11 +65,8 @@ def test_a_stage_has_the_class_weights_of_its_scans_if_the_recipe_says_so(
     counts = np.zeros(20, dtype=np.int64)
     dataset = open_dataset(str(world / "data"))
     for record in dataset.records(("00", "01", "02", "03", "04")):
-        labels = dataset.read(record).labels
-        assert labels is not None
-        counts += np.bincount(labels, minlength=20)
-    assert stage.class_weights is not None
-    np.testing.assert_array_equal(stage.class_weights, class_weights(counts[1:], power))
+        counts += np.bincount(not_none(dataset.read(record).labels), minlength=20)
+    np.testing.assert_array_equal(not_none(stage.class_weights), class_weights(counts[1:], power))
 
 
 def test_the_loss_of_the_head_equals_its_formula() -> None:

@@ -38,7 +38,7 @@ from amvnet.training.networks import NetworkStage, train_network
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.commands import contents, files, refusal, refused, run_cli, succeed
+from fixtures.commands import contents, files, not_none, refusal, refused, run_cli, succeed
 from fixtures.processes import Printed, become_cli, fork_server, start_cli
 from fixtures.tiny import (
     BUILDING,
@@ -208,8 +208,7 @@ def test_the_weights_describe_their_training(run: Path) -> None:
     assert weights.training["range_net"]["rv"]["epochs"] == 3
     assert weights.model.range_view.width == 64
     assert weights.expects.as_is
-    assert weights.expects.intensity is not None
-    assert weights.expects.intensity.are_fractions
+    assert not_none(weights.expects.intensity).are_fractions
 
 
 def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from amvnet.viewing.shown_scans import CORRECT, ShownScan, shown_scan
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page, with_script
-from fixtures.commands import files, refusal, refused, run_cli
+from fixtures.commands import files, not_none, refusal, refused, run_cli
 from fixtures.marks import with_full
 from fixtures.pages import Changes, DocsPage, run
 from fixtures.scan_writers import write_bag1
@@ -92,8 +92,7 @@ def test_every_scan_is_in_the_page_as_it_is(path: Path, dataset: SemanticKitti) 
         assert (np.abs(xyz - scan.points[:, :3]) <= 0.51 * step + 1e-5).all()
         intensity = np.clip(scan.points[:, 3], 0, 1)
         assert np.abs(planes["intensity"] / 255 - intensity).max() <= 0.5 / 255 + 1e-6
-        assert scan.labels is not None
-        np.testing.assert_array_equal(planes["truth"], scan.labels)
+        np.testing.assert_array_equal(planes["truth"], not_none(scan.labels))
 
 
 def test_the_page_has_all_methods_labels(world: Path, path: Path, dataset: SemanticKitti) -> None:

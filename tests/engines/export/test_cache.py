@@ -25,7 +25,7 @@ from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS_BY_METHOD
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights
 
-from fixtures.commands import files
+from fixtures.commands import files, not_none
 from fixtures.tiny import fresh_weights, street
 
 WEIGHTS = fresh_weights()
@@ -75,9 +75,7 @@ def cached(weights: Weights = WEIGHTS, int8: bool = False) -> tuple[dict[str, by
 
 
 def filled(weights: Weights = WEIGHTS) -> Path:
-    folder = cached_networks(weights).folder
-    assert folder is not None
-    return folder
+    return not_none(cached_networks(weights).folder)
 
 
 def test_networks_are_exported_once_for_each_weights_and_precision(exports: Exports) -> None:
