@@ -397,8 +397,7 @@ def test_the_longest_names_can_be_written(name: str, tmp_path: Path) -> None:
 
 
 def test_a_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / ("a" * 256)
-    with pytest.raises(InputError, match="too long"), atomic_write(path):
+    with pytest.raises(InputError, match="too long"), atomic_write(tmp_path / ("a" * 256)):
         pass
     assert not list(tmp_path.iterdir())
 

@@ -134,9 +134,8 @@ def test_columns_of_any_order_type_and_padding_are_read(tmp_path: Path, size: in
     intensity = np.round(points[:, 3] * 255)
 
     real = f"f{size}"
-    padding_before = ("_a", "u1", 3)
     padding_within = ("_b", "f4")
-    axes = [padding_before, ("y", real), ("x", real), padding_within, ("z", real)]
+    axes = [("_a", "u1", 3), ("y", real), ("x", real), padding_within, ("z", real)]
     table = np.zeros(60, [*axes, ("ring", "u2"), ("intensity", "u1")])
     fill_coordinates(table, points)
     table["ring"] = ring
@@ -493,9 +492,8 @@ def test_a_transposed_array_is_refused(tmp_path: Path, shape: tuple[int, ...]) -
 
 def test_columns_of_no_single_number_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
-    axes = [("y", "f4"), ("z", "f4")]
     for kind in (("x", "f4", 3), ("x", "U3"), ("x", [("a", "f4")])):
-        np.save(path, np.zeros(60, [kind, *axes]))
+        np.save(path, np.zeros(60, [kind, ("y", "f4"), ("z", "f4")]))
         fails(lambda: read_scan(path), path, "'x'")
 
 

@@ -148,8 +148,7 @@ def command(world: Path, out: Path, *options: object) -> str:
 
 def test_both_formats_read_back_equal_and_as_the_figures_say(world: Path, tmp_path: Path) -> None:
     laspy = pytest.importorskip("laspy")
-    options = ("--keep-movable", "--json", tmp_path / "map.json")
-    succeed(command(world, tmp_path / "map.ply", *options))
+    succeed(command(world, tmp_path / "map.ply", "--keep-movable", "--json", tmp_path / "map.json"))
     succeed(command(world, tmp_path / "map.laz", "--keep-movable"))
     figures = json.loads((tmp_path / "map.json").read_text())
 

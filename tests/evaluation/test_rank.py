@@ -209,9 +209,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save(without(WEIGHTS, "polar_net"), root / "rv.safetensors")
     save(fresh_weights(NUSCENES), root / "nuscenes.safetensors")
 
-    command = ("rank", root / "data", "--weights", root / "w.safetensors")
     outputs = ("--out", root / "labels.csv")
-    assert run_cli(*command, *outputs) == (0, "")
+    assert run_cli("rank", root / "data", "--weights", root / "w.safetensors", *outputs) == (0, "")
     return root
 
 

@@ -79,8 +79,7 @@ def test_the_flags_declare_what_the_method_uses(
 ) -> None:
     case = cases["nuscenes"]
     out = tmp_path / "s.zip"
-    arguments = ("--predictions", case.predictions, "--out", out, *options)
-    assert submit(case.spec, *arguments) == (0, "")
+    assert submit(case.spec, "--predictions", case.predictions, "--out", out, *options) == (0, "")
 
     assert case.official(out, case.data) == []
     flags = json.loads(read_entries(out)["test/submission.json"])["meta"]
@@ -89,10 +88,9 @@ def test_the_flags_declare_what_the_method_uses(
 
 @pytest.mark.parametrize(("name", "folder"), [("semantickitti", "."), ("nuscenes", "results")])
 def test_the_golden_validation_sets_can_be_packed(name: str, folder: str, tmp_path: Path) -> None:
-    spec = f"{name}:{GOLDEN / name}"
     predictions = GOLDEN / name / folder
     options = ("--split", "val", "--predictions", predictions, "--out", tmp_path / "s.zip")
-    assert submit(spec, *options) == (0, "")
+    assert submit(f"{name}:{GOLDEN / name}", *options) == (0, "")
 
 
 # --- writing ---
@@ -106,8 +104,7 @@ def peak_memory(root: Path, scans: int, points: int) -> int:
         write_files(root, {f"sequences/08/predictions/{scan:06d}.label": raw.tobytes()})
 
     rules = rules_for(open_dataset(str(root)), "val")
-    out = root / "s.zip"
-    _, peak = measured(lambda: write_archive(rules, root, out))
+    _, peak = measured(lambda: write_archive(rules, root, root / "s.zip"))
     return peak
 
 

@@ -264,10 +264,9 @@ def test_broken_scores_are_one_line_that_says_what_to_do(world: Path, tmp_path: 
 
 def test_wrong_options_of_fuse_are_one_line(world: Path, tmp_path: Path) -> None:
     taxonomy = ("--taxonomy", "nuscenes")
-    head = ("--head", world / "w.safetensors")
 
     assert "expected a folder" in run_fuse(world, tmp_path, a=tmp_path / "none")
-    assert "leave it out" in run_fuse(world, tmp_path, *head, *taxonomy)
+    assert "leave it out" in run_fuse(world, tmp_path, "--head", world / "w.safetensors", *taxonomy)
     assert "nuscenes" in run_fuse(world, tmp_path, *taxonomy)
     assert not files(tmp_path)
 
@@ -333,8 +332,7 @@ def test_fuse_takes_the_weights_of_the_head_alone(world: Path, head: Path, tmp_p
     labels = np.fromfile(tmp_path / f"{SCAN}.label", np.uint32)
     assert np.array_equal(weights.taxonomy.to_raw(ids), labels)
 
-    options = ("--weights", head, "--out", tmp_path / "x")
-    _, error = run_cli("predict", world / "data", *options)
+    _, error = run_cli("predict", world / "data", "--weights", head, "--out", tmp_path / "x")
     assert "range_net" in error
 
 

@@ -103,8 +103,7 @@ def test_broken_scans_are_listed_others_labelled(world: Path, whole: Path, tmp_p
     (scans / "000003.bin").write_bytes(b"123")
     (scans / "000007.bin").write_bytes(b"")
 
-    options = ("--weights", world / WEIGHTS, "--out", tmp_path / "out")
-    code, error = run_cli("predict", scans, *options)
+    code, error = run_cli("predict", scans, "--weights", world / WEIGHTS, "--out", tmp_path / "out")
     assert code == 3
     first, second, summary = error.splitlines()
     assert "000003.bin" in first

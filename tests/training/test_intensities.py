@@ -77,10 +77,9 @@ def test_predict_gives_finished_weights_the_intensities_of_their_training(
         "other classes": trained_before(fresh_weights(), is_optional=True, is_matched=True),
         "unmatched": trained_before(fresh_weights(classes)),
     }
-    init = inits[begin]
 
     data = str(own / "robot.yaml")
-    plan = Plan.open(recipe, [data], tmp_path / "run", to_train, init, stage=stage)
+    plan = Plan.open(recipe, [data], tmp_path / "run", to_train, inits[begin], stage=stage)
     expects = expectation_of(plan.data, first_weights(plan), plan.recipe, plan.stages)
     _, val = make_loaders(plan, recipe.training.rv, expects)
     assert val is not None

@@ -84,8 +84,7 @@ def differing(a: Weights, b: Weights) -> set[str]:
 def scored(world: Path, folder: Path, weights: Path, *options: object) -> dict[str, Any]:
     """Return the figures of `evaluate`, which writes them into a folder."""
     figures = folder / "figures.json"
-    command = ("evaluate", world / "data", "--weights", weights, "--json", figures)
-    succeed(*command, *options)
+    succeed("evaluate", world / "data", "--weights", weights, "--json", figures, *options)
     return dict(json.loads(figures.read_text()))
 
 

@@ -309,8 +309,7 @@ def test_labels_that_predict_wrote_are_shown(world: Path, path: Path, tmp_path: 
     assert run_cli("predict", world / "data", world / "lone.bin", *weights)[0] == 0
 
     expected = read_page(path)
-    options = ("--labels", tmp_path / "labels", "--scans", 6)
-    page = view_page(tmp_path, world / "data", *options)
+    page = view_page(tmp_path, world / "data", "--labels", tmp_path / "labels", "--scans", 6)
     for index in range(6):
         _, planes = page.scan(index)
         _, expected_planes = expected.scan(index)

@@ -114,8 +114,7 @@ def test_the_commands_take_names_of_the_hub(
     amvnet.push(save(WEIGHTS, tmp_path / "w.safetensors"), "somebody/streets")
     scan = tmp_path / "a.bin"
     POINTS.tofile(scan)
-    options = ("--weights", NAME, "--out", tmp_path / "out")
-    assert run_cli("predict", scan, *options) == (0, "")
+    assert run_cli("predict", scan, "--weights", NAME, "--out", tmp_path / "out") == (0, "")
     capsys.readouterr()
 
     # `info` prints the card that lies on the hub, without its front matter.
