@@ -13,26 +13,14 @@ from amvnet.data.formats.bag_poses import BagPoses
 from amvnet.data.formats.detect import ending_of
 from amvnet.progress import report_nothing
 
-from fixtures.bag_poses import (
-    FIRST,
-    ODOMETRY,
-    PERIOD,
-    POSE,
-    POSE_WITH_COVARIANCE,
-    Sent,
-    cloud,
-    drive_odometry,
-    odometry,
-    pose_at,
-    transform,
-    write_bag,
-)
+from fixtures import bag_poses
+from fixtures.bag_poses import FIRST, ODOMETRY, Sent, drive_odometry, odometry, transform, write_bag
 from fixtures.commands import fails
 
 SCANS = 6
 POINTS = np.ones((4, 4), np.float32)
-TIMES = [FIRST + PERIOD * index for index in range(SCANS)]
-CLOUDS = [cloud(time, POINTS) for time in TIMES]
+TIMES = [FIRST + bag_poses.PERIOD * index for index in range(SCANS)]
+CLOUDS = [bag_poses.cloud(time, POINTS) for time in TIMES]
 
 
 def place(x: float, y: float, z: float, yaw: float, pitch: float = 0.0) -> np.ndarray:
@@ -83,7 +71,7 @@ def shaken(seed: int, count: int = 40) -> tuple[list[float], list[np.ndarray]]:
     poses = []
     for time in times:
         x, y, z, yaw, pitch = rng.normal(0, 0.1, 5)
-        poses.append(pose_at(time) @ place(x, y, z, yaw, pitch))
+        poses.append(bag_poses.pose_at(time) @ place(x, y, z, yaw, pitch))
     return times.tolist(), poses
 
 
@@ -145,7 +133,7 @@ def test_a_robot_that_stands_still_is_where_tf_says(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses_of(bag, "/tf"), [expected] * SCANS, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [ODOMETRY, POSE, POSE_WITH_COVARIANCE])
+@pytest.mark.parametrize("kind", [ODOMETRY, bag_poses.POSE, bag_poses.POSE_WITH_COVARIANCE])
 def test_without_a_static_transform_poses_are_the_lidars(tmp_path: Path, kind: str) -> None:
     times, poses = shaken(0)
     bag = write_bag(tmp_path / "drive", [*odometry_of(times, poses, "base", kind), *CLOUDS])
@@ -177,7 +165,9 @@ def in_circle() -> list[Sent]:
 
 
 def of_another_epoch() -> list[Sent]:
-    return [odometry(one.time + 1.7e9, pose_at(one.time)) for one in drive_odometry(SCANS)]
+    return [
+        odometry(one.time + 1.7e9, bag_poses.pose_at(one.time)) for one in drive_odometry(SCANS)
+    ]
 
 
 def of_two_frames() -> list[Sent]:

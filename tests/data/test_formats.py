@@ -32,17 +32,9 @@ from amvnet.data.labels.readers import read_raw_labels
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 
+from fixtures import scan_writers
 from fixtures.commands import fails, not_none
-from fixtures.scan_writers import (
-    FLOATS,
-    WRITERS,
-    cloud_message,
-    pcd_bytes,
-    some_points,
-    write_bag1,
-    write_bag2,
-    write_las,
-)
+from fixtures.scan_writers import WRITERS, pcd_bytes, some_points, write_bag1, write_bag2
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 LAS_STEP = 0.0006  # metres: the LAS files have millimetres
@@ -115,7 +107,7 @@ def test_a_truncated_file_is_refused(folder: Path, tmp_path: Path, name: str) ->
 
 def test_comments_of_a_header_may_hold_any_bytes(tmp_path: Path) -> None:
     path = tmp_path / "a.pcd"
-    content = pcd_bytes(some_points().view(FLOATS), FLOAT_FIELDS)
+    content = pcd_bytes(some_points().view(scan_writers.FLOATS), FLOAT_FIELDS)
     for comment in (b"# M\xfcller \xff\xfe\x80\n", "# 点群\n".encode()):
         path.write_bytes(content.replace(b"VERSION", comment + b"VERSION", 1))
         np.testing.assert_array_equal(read_scan(path).points, some_points())
@@ -178,7 +170,7 @@ def test_lost_points_of_an_organised_cloud_keep_their_index(tmp_path: Path) -> N
     points[7] = 0
     points[9, 0] = np.inf
     path = tmp_path / "a.pcd"
-    path.write_bytes(pcd_bytes(points.view(FLOATS), FLOAT_FIELDS, height=4))
+    path.write_bytes(pcd_bytes(points.view(scan_writers.FLOATS), FLOAT_FIELDS, height=4))
 
     scan = read_scan(path)
     assert np.flatnonzero(~scan.valid).tolist() == [3, 7, 9]
@@ -368,7 +360,7 @@ def test_vertices_with_lists_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("big", [False, True])
 def test_messages_with_gaps_and_either_byte_order_are_read(padded: bool, big: bool) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
-    cloud = read_message(cloud_message(store, some_points(), padded, big), "here")
+    cloud = read_message(scan_writers.cloud_message(store, some_points(), padded, big), "here")
     np.testing.assert_array_equal(cloud.to_scan().points, some_points())
     assert (cloud.ring is not None) == padded
 
@@ -378,7 +370,9 @@ def test_messages_with_gaps_and_either_byte_order_are_read(padded: bool, big: bo
     [{"width": 61}, {"width": 2**32 - 1, "row_step": 0}, {"row_step": 10}, {"fields": []}],
 )
 def test_a_message_that_claims_more_than_it_has_is_refused(changes: dict[str, Any]) -> None:
-    message = cloud_message(get_typestore(Stores.ROS2_HUMBLE), some_points(), **changes)
+    message = scan_writers.cloud_message(
+        get_typestore(Stores.ROS2_HUMBLE), some_points(), **changes
+    )
     fails(lambda: read_message(message, "here"), "here")
 
 
@@ -543,7 +537,7 @@ def test_intensities_are_scaled_by_their_range(tmp_path: Path, largest: int, kin
 
 
 def test_a_dimension_of_las_with_rings_is_read(tmp_path: Path) -> None:
-    las = laspy.read(write_las(tmp_path / "a.las", some_points()))
+    las = laspy.read(scan_writers.write_las(tmp_path / "a.las", some_points()))
     assert read_cloud(tmp_path / "a.las").ring is None
     las.add_extra_dim(laspy.ExtraBytesParams("ring", "u1"))
     las["ring"] = np.arange(60) % 16

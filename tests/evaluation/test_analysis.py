@@ -30,16 +30,9 @@ from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save
 
+from fixtures import tiny
 from fixtures.commands import files, not_none, refused, succeed
-from fixtures.tiny import (
-    fresh_weights,
-    make_streets,
-    street,
-    with_intensities,
-    with_model,
-    write_recipe,
-    write_scan,
-)
+from fixtures.tiny import fresh_weights, with_intensities, with_model, write_recipe, write_scan
 
 K = 19
 STREET = ("car", "road", "sidewalk", "building")  # the classes of the points
@@ -118,7 +111,7 @@ def test_points_that_no_network_sees_count_as_evaluate_counts_them(
 ) -> None:
     if are_matched:
         weights = with_matched_intensities(weights)
-    points, raw = street(1)
+    points, raw = tiny.street(1)
     points[::3, 0] = np.nan
     write_scan(tmp_path, "08", "000000", points, raw)
     dataset = open_dataset(f"semantickitti:{tmp_path}")
@@ -313,7 +306,7 @@ def test_ablate_trains_four_networks_and_goes_on_later(world: Path, tmp_path: Pa
     succeed(command)
     assert (out / "ablation.csv").read_text() == text
 
-    other = make_streets(tmp_path / "data", ("02", "03", "08"))
+    other = tiny.make_streets(tmp_path / "data", ("02", "03", "08"))
     refused(command.replace(f"{world}/data", str(other)), "scans")
     for path, end in ends.items():
         assert path.read_bytes()[-1000:] == end

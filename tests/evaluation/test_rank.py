@@ -19,15 +19,8 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.evaluation.label_errors import (
-    CELL,
-    VEHICLE_RADIUS,
-    PointDoubts,
-    cluster,
-    find_clusters,
-    measure_doubts,
-    rank,
-)
+from amvnet.evaluation import label_errors
+from amvnet.evaluation.label_errors import PointDoubts, cluster, find_clusters, measure_doubts, rank
 from amvnet.weights.file import save
 
 from fixtures.commands import files, not_none, refused, run_cli
@@ -48,7 +41,7 @@ WALL = 13
 
 def clusters_by_flooding(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
     """Return the same clusters by a plain loop over cells."""
-    cells = np.column_stack([np.floor(xyz / CELL).astype(int), kind])
+    cells = np.column_stack([np.floor(xyz / label_errors.CELL).astype(int), kind])
     cluster_ids = np.full(len(cells), -1)
     for start in range(len(cells)):
         if cluster_ids[start] >= 0:
@@ -146,7 +139,7 @@ def test_a_doubt_is_the_agreed_class_in_the_less_certain_view_over_the_label_in_
     for index, label in enumerate(labels):
         agreed = np.argmax(f[index] * g[index])
         expected = 0.0
-        if label > 0 and np.hypot(points[index, 0], points[index, 1]) >= VEHICLE_RADIUS:
+        if label > 0 and np.hypot(*points[index, :2]) >= label_errors.VEHICLE_RADIUS:
             of_label = max(f[index, label - 1], g[index, label - 1])
             expected = max(min(f[index, agreed], g[index, agreed]) - of_label, 0)
         assert doubts.doubt[index] == pytest.approx(expected, abs=1e-5)

@@ -16,17 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import RangeNetConfig
 from amvnet.models import layers, range_net
-from amvnet.models.layers import (
-    ROWS,
-    AzimuthGRU,
-    PointLinear,
-    RingConv2d,
-    _kernels,
-    convolve_joined,
-    freeze,
-    upsample,
-    wrap_width,
-)
+from amvnet.models.layers import AzimuthGRU, PointLinear, RingConv2d, convolve_joined, wrap_width
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.weights.file import load
@@ -109,7 +99,7 @@ def test_the_rows_of_a_point_linear_layer_are_not_copied_if_they_have_code_of_th
                 places.append(args[0].data_ptr())
             return func(*args, **(kwargs or {}))
 
-    x = torch.zeros(ROWS, 4)
+    x = torch.zeros(layers.ROWS, 4)
     with torch.inference_mode(), Watching():
         PointLinear(4, 3)(x)
     assert places == [x.data_ptr()]
@@ -167,7 +157,7 @@ def test_the_unet_of_polar_net_is_equivariant_to_a_shift_by_its_stride() -> None
 
 def joined_maps(coarse: Tensor, fine: Tensor) -> Tensor:
     """Return the input that `convolve_joined` avoids: both maps, the coarse one upsampled."""
-    return torch.cat([upsample(coarse, fine), fine], dim=1)
+    return torch.cat([layers.upsample(coarse, fine), fine], dim=1)
 
 
 @pytest.mark.parametrize(
@@ -332,7 +322,7 @@ def test_the_gru_equals_a_loop_over_the_cells(share: float, padding: int) -> Non
 )
 def test_upsample_gives_values_to_the_cells_they_mean(height: int, width: int, factor: int) -> None:
     coarse = torch.randn(1, 2, math.ceil(height / factor), math.ceil(width / factor))
-    fine = upsample(coarse, torch.zeros(1, 9, height, width))
+    fine = layers.upsample(coarse, torch.zeros(1, 9, height, width))
     assert fine.shape == (1, 2, height, width)
 
     for row in range(height):
@@ -350,7 +340,7 @@ def test_folded_batch_norms_change_no_output_of_a_network(case: Case) -> None:
     before = case.run(net, 3)
     assert count_norms(net) > 1
 
-    freeze(net)
+    layers.freeze(net)
     torch.testing.assert_close(case.run(net, 3), before, rtol=1e-4, atol=1e-4)
     # The norms of the inputs of the MLP and of the U-Net stay: no layer is before them.
     assert count_norms(net) == 1 + isinstance(getattr(net, "norm", None), nn.BatchNorm2d)
@@ -402,9 +392,9 @@ def test_under_autocast_the_recurrence_and_sums_of_weights_stay_in_float32() -> 
     x = torch.randn(1, 8, 2, 16)
     with torch.inference_mode():
         expected = gru(x)
-        kernels = _kernels(convolution, weight, (1, 2))
+        kernels = layers._kernels(convolution, weight, (1, 2))
         with torch.autocast("cpu", torch.bfloat16):
             assert gru(x).dtype == torch.float32
             assert torch.equal(gru(x), expected)
-            assert _kernels(convolution, weight, (1, 2)).dtype == torch.float32
-            assert torch.equal(_kernels(convolution, weight, (1, 2)), kernels)
+            assert layers._kernels(convolution, weight, (1, 2)).dtype == torch.float32
+            assert torch.equal(layers._kernels(convolution, weight, (1, 2)), kernels)

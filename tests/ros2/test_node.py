@@ -28,15 +28,8 @@ from amvnet.scan import Scan
 from amvnet_ros.fusion import PastFusion
 from amvnet_ros.messages import Message
 
-from fixtures.bag_poses import (
-    FIRST,
-    PERIOD,
-    cloud,
-    drive_clouds,
-    drive_odometry,
-    pose_at,
-    write_bag,
-)
+from fixtures import bag_poses
+from fixtures.bag_poses import FIRST, PERIOD, cloud, drive_odometry, pose_at, write_bag
 from fixtures.commands import not_none, succeed
 from fixtures.drives import drive_scans
 from fixtures.processes import PATIENCE
@@ -343,7 +336,7 @@ class Drive:
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    messages = [as_rclpy_gives_it(sent.make(STORE)) for sent in drive_clouds(DRIVE_SCANS)]
+    messages = [as_rclpy_gives_it(sent.make(STORE)) for sent in bag_poses.drive_clouds(DRIVE_SCANS)]
     odometry = drive_odometry(DRIVE_SCANS)
     return Drive(messages, {round(sent.time * 1e9): pose_at(sent.time) for sent in odometry})
 
@@ -379,7 +372,9 @@ def warnings_of(node: Any) -> list[str]:
 def test_scans_are_fused_with_past_scans_as_by_predict_on_a_bag(
     start: Start, weights: Path, tmp_path: Path, drive: Drive
 ) -> None:
-    bag = write_bag(tmp_path / "bag", [*drive_odometry(DRIVE_SCANS), *drive_clouds(DRIVE_SCANS)])
+    bag = write_bag(
+        tmp_path / "bag", [*drive_odometry(DRIVE_SCANS), *bag_poses.drive_clouds(DRIVE_SCANS)]
+    )
     options = "--drive --past-only --poses /odom --format npy"
     for name, value in SENSOR.items():
         options += f" --{name.replace('_', '-')} {value}"

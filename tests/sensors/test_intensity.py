@@ -34,17 +34,10 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.training.expectation import expectation_of
 from amvnet.weights.file import Weights
 
+from fixtures import tiny
 from fixtures.commands import fails, not_none
 from fixtures.sensors import LASERS, ground_height, place
-from fixtures.tiny import (
-    fresh_weights,
-    make_streets,
-    street,
-    trained_for,
-    with_intensities,
-    without,
-    write_scan,
-)
+from fixtures.tiny import fresh_weights, with_intensities, write_scan
 
 TRAINED = np.array(SIMULATED_QUANTILES["hdl64e"])
 
@@ -59,7 +52,7 @@ def scan_points(height: float = 1.73, seed: int = 0) -> np.ndarray:
 
 def weights_with(**how: bool) -> Weights:
     """Return weights that were trained with the intensities of simulated scans."""
-    weights = trained_for(fresh_weights(), "hdl64e")
+    weights = tiny.trained_for(fresh_weights(), "hdl64e")
     return with_intensities(weights, SIMULATED_QUANTILES["hdl64e"], **how)
 
 
@@ -208,7 +201,7 @@ def test_quantiles_that_no_intensities_have_are_refused(values: Any) -> None:
 def measured_intensity(data: SemanticKitti, sequences: Sequence[str]) -> TrainedIntensity | None:
     """Return the intensities that networks expect which are trained on a dataset from scratch."""
     scans = TrainingData([Source(data, data.records(sequences))])
-    weights = without(fresh_weights(), *PARTS)
+    weights = tiny.without(fresh_weights(), *PARTS)
     return expectation_of(scans, weights, Recipe(), ("rv", "bev")).intensity
 
 
@@ -217,7 +210,7 @@ def test_scans_without_intensities_have_zeros_and_equal_ones_are_left_out(tmp_pa
     for level, expected in ((0.0, none), (0.5, None)):
         root = tmp_path / f"{level}"
         for index in range(2):
-            points, raw = street(index)
+            points, raw = tiny.street(index)
             points[:, 3] = level
             write_scan(root, "00", f"{index:06d}", points, raw)
         assert measured_intensity(SemanticKitti(root), ["00"]) == expected
@@ -226,7 +219,7 @@ def test_scans_without_intensities_have_zeros_and_equal_ones_are_left_out(tmp_pa
 
 
 def test_training_measures_the_intensities_that_weights_carry(tmp_path: Path) -> None:
-    data = SemanticKitti(make_streets(tmp_path, ("00", "01"), 2))
+    data = SemanticKitti(tiny.make_streets(tmp_path, ("00", "01"), 2))
     records = data.records(("00", "01"))
     intensity = measured_intensity(data, ("00", "01"))
 

@@ -24,20 +24,11 @@ from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
+from amvnet.sensors import lidars
 from amvnet.sensors.expectation import Expectation
 from amvnet.sensors.ground import find_ground
 from amvnet.sensors.lasers import SensorGeometry, measure
-from amvnet.sensors.lidars import (
-    ANY,
-    AXES,
-    BUILT_IN,
-    KNOWN_HEIGHTS,
-    KNOWN_SENSORS,
-    UNKNOWN_SENSOR,
-    Sensor,
-    make_sensor,
-    rotation_from_degrees,
-)
+from amvnet.sensors.lidars import KNOWN_SENSORS, Sensor, make_sensor, rotation_from_degrees
 from amvnet.sensors.measure import MEASURED_SCANS, raise_points
 from amvnet.sensors.normalise import Normalised, Normaliser, normalised
 from amvnet.sensors.rows import _row_view
@@ -113,7 +104,7 @@ def test_real_sensors_have_the_height_that_is_known(name: str, model: str) -> No
 
         heights.append(not_none(geometry.height))
 
-    expected = KNOWN_HEIGHTS[model]
+    expected = lidars.KNOWN_HEIGHTS[model]
     assert np.median(heights) == pytest.approx(expected, abs=0.1)
     assert np.abs(np.array(heights) - expected).max() < 0.2
 
@@ -122,7 +113,7 @@ def test_real_sensors_have_the_height_that_is_known(name: str, model: str) -> No
 
 
 def make_recording(
-    sensor: Sensor = UNKNOWN_SENSOR, name: str = "hdl64e", is_nuscenes: bool = False
+    sensor: Sensor = lidars.UNKNOWN_SENSOR, name: str = "hdl64e", is_nuscenes: bool = False
 ) -> tuple[Normalised, list[str]]:
     """Return a recording as fresh weights expect it, and the list of the lines that it says."""
     lines: list[str] = []
@@ -161,7 +152,7 @@ def test_a_given_height_counts_whatever_the_ground_says() -> None:
     np.testing.assert_allclose(scan.points[:, 2] - points[:, 2], 0.5, atol=1e-5)
 
 
-@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("axes", lidars.AXES)
 @pytest.mark.parametrize("turn", first_of([(30, 10, -5), (0, 0, 0), (90, 0, 0)]))
 def test_any_described_frame_gives_one_scan(axes: str, turn: tuple[float, float, float]) -> None:
     points, _ = place(LASERS["os1-64"], 1.2)
@@ -170,7 +161,7 @@ def test_any_described_frame_gives_one_scan(axes: str, turn: tuple[float, float,
     expected = level.to_scan(make_cloud(points))
 
     offset = (0.1, -0.2, 0.4)
-    matrix = rotation_from_degrees(*turn) @ np.array(AXES[axes], float)
+    matrix = rotation_from_degrees(*turn) @ np.array(lidars.AXES[axes], float)
     file_xyz = (points[:, :3] - offset) @ matrix  # the inverse of matrix @ file_xyz + offset
     file_xyz[5] = 0
 
@@ -213,7 +204,7 @@ def test_rotations_are_yaw_pitch_and_roll() -> None:
     np.testing.assert_allclose(roll @ left, up, atol=1e-12)
 
 
-@pytest.mark.parametrize("axes", AXES.values())
+@pytest.mark.parametrize("axes", lidars.AXES.values())
 def test_axes_do_not_mirror(axes: Any) -> None:
     assert np.linalg.det(np.array(axes)) == pytest.approx(1)
 
@@ -384,7 +375,7 @@ def test_a_warning_of_another_sensor_names_weights_that_fit(laser: str, advice: 
 
 
 def test_the_table_of_built_in_weights_has_the_sensors_of_their_files() -> None:
-    assert {name: load(name).sensor for name in built_in()} == BUILT_IN
+    assert {name: load(name).sensor for name in built_in()} == lidars.BUILT_IN
 
 
 def test_the_sensor_of_the_training_is_said_to_be_familiar_and_in_place() -> None:
@@ -424,7 +415,7 @@ COORDINATE = (
     | st.sampled_from([0.0, 1.0, -1.7, 1e4, 3e38])
 )
 STATED = [
-    UNKNOWN_SENSOR,
+    lidars.UNKNOWN_SENSOR,
     Sensor(fov_up=-40),
     KNOWN_SENSORS["vlp16"],
     Sensor(height=1, rotate=(1, 2, 3)),
@@ -520,9 +511,9 @@ def test_sensors_are_described_as_they_are_simulated() -> None:
         assert sensor.beams == len(simulated.elevations)
         assert sensor.fov_up == pytest.approx(top, abs=0.1)
         assert sensor.fov_down == pytest.approx(bottom, abs=0.5)
-        if name in KNOWN_HEIGHTS:  # the sensor of weights is mounted at one height
-            assert KNOWN_HEIGHTS[name] == simulated.height
-    assert set(KNOWN_HEIGHTS) <= {*LIDAR_MODELS, ANY}
+        if name in lidars.KNOWN_HEIGHTS:  # the sensor of weights is mounted at one height
+            assert lidars.KNOWN_HEIGHTS[name] == simulated.height
+    assert set(lidars.KNOWN_HEIGHTS) <= {*LIDAR_MODELS, lidars.ANY}
 
 
 # --- on the command line

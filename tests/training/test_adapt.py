@@ -15,15 +15,9 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.drives.consensus import Consensus, DriveScan
 from amvnet.inference.drive import TURN, find_poses
 from amvnet.inference.listing import find_inputs
+from amvnet.training import adapt
 from amvnet.training import adapt as adapting
-from amvnet.training.adapt import (
-    FIGURES,
-    LEAST_PROBABILITY,
-    Figures,
-    TaughtScans,
-    recipe_for,
-    teach,
-)
+from amvnet.training.adapt import LEAST_PROBABILITY, Figures, recipe_for, teach
 from amvnet.weights.file import load, save
 
 from fixtures.commands import not_none, refused, run_cli, succeed
@@ -87,7 +81,7 @@ def test_points_teach_of_which_the_consensus_is_sure(world: Path) -> None:
         teaches = (scores.max(axis=1) > 0.07) & (labels > 0)
         np.testing.assert_array_equal(taught, np.where(teaches, labels, 0))
         assert set(teaches.tolist()) == {True, False}
-    figures = json.loads((world / "run" / TEACHER).parent.joinpath(FIGURES).read_text())
+    figures = json.loads((world / "run" / TEACHER).parent.joinpath(adapt.FIGURES).read_text())
     valid = sum(np.count_nonzero(result.labels) for result in results)
     uncertain = sum(np.count_nonzero(result.uncertain) for result in results)
     assert figures["uncertain"] == pytest.approx(uncertain / valid)
@@ -116,7 +110,7 @@ def test_drives_whose_names_are_alike_teach_by_labels_of_their_own(
         scans, _ = find_inputs(inputs).scans(taxonomy=segmenter.taxonomy)
         labels_of = Path(f"{inputs[0]}.labels")
         teach(scans, None, segmenter, labels_of)
-        taught = TaughtScans(scans, labels_of, segmenter.weights)
+        taught = adapt.TaughtScans(scans, labels_of, segmenter.weights)
         assert len(taught.parts()["train"]) == 2
         for name, drive in zip(taught.parts()["train"], (scans[:2], scans[2:]), strict=True):
             for record, scan in zip(taught.records([name]), drive, strict=True):

@@ -35,24 +35,17 @@ from amvnet.training.losses import rival_classes
 from amvnet.training.plan import Plan, open_for_training, sized_by_init, without_initial_weights
 from amvnet.weights.file import Weights, load, save
 
+from fixtures import tiny
 from fixtures.commands import fails, not_none, refusal, refused, run_cli, succeed
 from fixtures.own_scans import make_own_scans
-from fixtures.tiny import (
-    BUILDING,
-    CAR,
-    GOLDEN,
-    fake_drive,
-    fresh_weights,
-    make_streets,
-    write_recipe,
-)
+from fixtures.tiny import fake_drive, fresh_weights, make_streets, write_recipe
 
 
 def relabel_cars(data: Path) -> None:
     """Call the cars of a dataset buildings, so that it lacks cars."""
     for path in data.rglob("*.label"):
         raw = np.fromfile(path, np.uint32)
-        raw[raw == CAR] = BUILDING
+        raw[raw == tiny.CAR] = tiny.BUILDING
         raw.tofile(path)
 
 
@@ -122,7 +115,7 @@ def test_the_check_finds_others_classes(tmp_path: Path, monkeypatch: pytest.Monk
     # A single stray point teaches nothing.
     path = next((tmp_path / "a/sequences/00").rglob("*.label"))
     raw = np.fromfile(path, np.uint32)
-    raw[0] = CAR
+    raw[0] = tiny.CAR
     raw.tofile(path)
     monkeypatch.setattr(checking, "STRAY_SHARE", 0.001)
     assert not check_data(plan)[1][0, car]
@@ -166,7 +159,7 @@ def test_mixed_scans_are_of_the_same_epoch(tmp_path: Path, monkeypatch: pytest.M
 def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: Path) -> None:
     a = open_dataset(str(make_streets(tmp_path / "a")))
     first = Source(a, a.records(["00"]))
-    nuscenes = open_dataset(f"nuscenes:{GOLDEN / 'nuscenes'}")
+    nuscenes = open_dataset(f"nuscenes:{tiny.GOLDEN / 'nuscenes'}")
     assert nuscenes.taxonomy == NUSCENES
     other = Source(nuscenes, nuscenes.records(nuscenes.sequences("all")))
     fails(lambda: TrainingData([first, other]), "classes")

@@ -38,21 +38,10 @@ from amvnet.training.networks import NetworkStage, train_network
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights, load, save
 
+from fixtures import tiny
 from fixtures.commands import contents, files, not_none, refusal, refused, run_cli, succeed
 from fixtures.processes import Printed, become_cli, fork_server, start_cli
-from fixtures.tiny import (
-    BUILDING,
-    CAR,
-    GOLDEN,
-    ROAD,
-    SIDEWALK,
-    fake_drive,
-    fresh_weights,
-    make_streets,
-    with_intensities,
-    without,
-    write_recipe,
-)
+from fixtures.tiny import CAR, fresh_weights, make_streets, with_intensities, without, write_recipe
 
 NO_AUGMENTATION = [f"--training.augment.{name}=0" for name in ("yaw", "scale", "flip")]
 PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
@@ -159,7 +148,7 @@ def test_the_class_counts_of_a_run_are_those_of_its_training_scans(world: Path, 
 
     paths = [*world.glob("data/sequences/00/labels/*"), *world.glob("data/sequences/01/labels/*")]
     raw_labels = np.concatenate([np.fromfile(path, np.uint32) for path in paths])
-    raw_ids = {0: CAR, 8: ROAD, 10: SIDEWALK, 12: BUILDING}  # by index of the class
+    raw_ids = {0: CAR, 8: tiny.ROAD, 10: tiny.SIDEWALK, 12: tiny.BUILDING}  # by index of the class
     for index, count in enumerate(counts):
         assert count == np.count_nonzero(raw_labels == raw_ids.get(index, -1))
 
@@ -348,7 +337,7 @@ def test_a_run_is_not_resumed_from_other_initial_weights(world: Path, tmp_path: 
 def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(simulated, "drive_street", fake_drive)
+    monkeypatch.setattr(simulated, "drive_street", tiny.fake_drive)
     monkeypatch.setattr(simulated, "SCANS", 2)
     options = ("--stage", "rv", "--train-sequences", "0,1", "--val-sequences", "900000")
     data = ("--data", f"simulated-hdl64e:{tmp_path / 'cache'}")
@@ -551,7 +540,7 @@ def test_an_incomplete_batch_of_parts_is_the_mean_of_its_scans(
 @pytest.mark.full
 def test_nuscenes_is_trained_predicted_and_evaluated(tmp_path: Path) -> None:
     recipe = write_recipe(tmp_path / "recipe.yaml", "nuscenes-compact")
-    data = GOLDEN / "nuscenes"
+    data = tiny.GOLDEN / "nuscenes"
     run = tmp_path / "run"
     scenes = ("--train-sequences", "scene-0103", "--val-sequences", "scene-0916")
     assert run_cli("train", recipe, "--data", data, "--out", run, *scenes) == (0, "")
