@@ -29,10 +29,7 @@ settings.load_profile("any machine")
 
 
 def _random_scan(count: int, seed: int = 0) -> Scan:
-    """Return random points all around the sensor, with labels and rings.
-
-    Some points are outside any field of view.
-    """
+    """Return points all around the sensor, some outside any field of view, labels and rings."""
     rng = np.random.default_rng(seed)
     xyz = rng.normal(0, (20, 20, 3), (count, 3))
     points = np.column_stack([xyz, rng.random(count)]).astype(np.float32)
@@ -68,10 +65,7 @@ def signal_handlers_are_kept() -> Iterator[None]:
 
 @pytest.fixture
 def hears_sigint() -> Iterator[None]:
-    """Let this process, and those that the test starts, hear SIGINT.
-
-    They ignore it if a shell has started the tests in the background.
-    """
+    """Let this process and its children hear SIGINT, which those of a shell's background ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -40,11 +40,7 @@ PLY = (
 
 @dataclass(frozen=True)
 class Case:
-    """A command, a file that it writes, and an earlier file of this kind.
-
-    Attributes:
-        file: its path relative to the folder of the output.
-    """
+    """A command, a file that it writes into its output, and an earlier file of this kind."""
 
     command: str
     file: str

@@ -64,10 +64,7 @@ each_command = pytest.mark.parametrize("command", first_of(("check", "train")))
 
 
 def refusal_by(command: str, data: Path) -> str:
-    """Check data that must be refused, or start a training with them; return the line.
-
-    The training is refused before it makes its folder.
-    """
+    """Check data, or train on them before the run has a folder; return the line of the refusal."""
     if command == "check":
         return refusal("check", data)
     recipe = write_recipe(data.parent / "recipe.yaml")

@@ -1,7 +1,4 @@
-"""Every format gives the same scan, whatever wrote it and whatever its name.
-
-Every point keeps its row.
-"""
+"""Every format gives the same scan, row by row, whatever wrote it and whatever its name."""
 
 from __future__ import annotations
 

@@ -17,13 +17,7 @@ from fixtures.tiny import GOLDEN
 
 @dataclass
 class Predictions:
-    """A golden dataset and a copy of predictions for it.
-
-    Attributes:
-        spec: how the command line opens the dataset.
-        folder: the folder of predictions.
-        dtype: number type of the predictions.
-    """
+    """A golden dataset and a folder with a copy of its predictions, which are of type `dtype`."""
 
     spec: str
     folder: Path

@@ -1,7 +1,4 @@
-"""Every command of the pages on your own scans and sensors does what the page says.
-
-The commands run on small simulated scans.
-"""
+"""Every command of the pages on own scans and sensors does what they say, on small scans."""
 
 from __future__ import annotations
 

@@ -87,10 +87,7 @@ def clouds() -> dict[str, np.ndarray]:
 
 
 def check_nearest(xyz: Tensor, own: Tensor, n: int = N) -> None:
-    """Check the neighbours by blocks against a k-d tree in double precision.
-
-    The distances have to be those of the n nearest others, and the neighbours different points.
-    """
+    """Compare the distances by blocks, all of different points, with an exact k-d tree's."""
     nearest = nearest_others_by_blocks(xyz, own, n).cpu().numpy()
     index = own.cpu().numpy()
     points = xyz.double().cpu().numpy()

@@ -101,8 +101,7 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
 def nearest_by_scipy(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     """Return (U, n) indices of the nearest other points of the points `own` (U,).
 
-    Among many points in one place a point may be missing from its own n + 1 nearest; then the
-    farthest of these is dropped.
+    Of many points in one place, a point may not find itself: then the farthest is dropped.
     """
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
     nearest = np.asarray(tree.query(xyz[own], k=n + 1)[1])

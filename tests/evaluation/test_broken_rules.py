@@ -15,13 +15,7 @@ from fixtures.submissions import Case, Entries, write_files
 
 @dataclass
 class Fault:
-    """A kind of bad predictions.
-
-    Attributes:
-        entries: returns the files.
-        words: words of the message.
-        official: whether the official validator refuses an archive of them, too.
-    """
+    """Bad predictions, words of their message, and whether the official validator refuses them."""
 
     entries: Callable[[Case], Entries]
     words: str

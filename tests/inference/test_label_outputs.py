@@ -104,11 +104,7 @@ READERS: dict[str, Callable[[Path], LabelFile]] = {
 def make_scan(
     dtype: type = np.float32, offset: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return coordinates and labels of a scan, one point of which is lost.
-
-    Returns:
-        (N, 3) coordinates, (N,) uint8 train ids with every class, (N,) bool uncertain points.
-    """
+    """Return coordinates, train ids of every class, and doubts of points, one of which is lost."""
     xyz = some_points(COUNT)[:, :3].astype(dtype) + dtype(offset)
     ids = np.random.default_rng(1).permutation(COUNT) % (SEMANTICKITTI.size + 1)
     xyz[LOST] = np.nan

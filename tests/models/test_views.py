@@ -53,10 +53,7 @@ def degenerate_scans() -> dict[str, Scan]:
 
 
 def on_half_metres(scan: Scan) -> Scan:
-    """Put the points on a grid of 0.5 m, off the borders of cells.
-
-    So distances are often equal, and all are exact in float32.
-    """
+    """Put points on a grid of 0.5 m: off borders of cells, often equally far, exact in float32."""
     points = scan.points.copy()
     points[:, :3] = np.round(points[:, :3] * 2) / 2 + np.float32(1 / 16)
     return replace(scan, points=points)

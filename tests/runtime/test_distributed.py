@@ -86,11 +86,7 @@ def printed_by(rank: int, folder: Path) -> Printed:
 
 
 def slurm(folder: Path, *arguments: object) -> list[tuple[int | None, str]]:
-    """Run the command line in two processes as srun does; return exit codes and what is printed.
-
-    Args:
-        folder: where files with what is printed are made.
-    """
+    """Run the command line in two processes as srun does; return exit codes and what is printed."""
     job = {
         "SLURM_JOB_ID": "4711",
         "SLURM_JOB_NAME": "amvnet",

@@ -13,10 +13,7 @@ from amvnet.training.curves import Curves
 
 @pytest.fixture(autouse=True)
 def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw no curves, which takes a fifth of a small training.
-
-    Fixtures of a wider scope are made before this one, and draw theirs.
-    """
+    """Draw no curves, a fifth of a small training; fixtures of wider scopes draw theirs before."""
 
     def draw_nothing(stages: Mapping[str, Curves], path: Path) -> Path:
         return path

@@ -674,11 +674,7 @@ def train_until_signal(words: list[str], printed: Printed, number: int) -> None:
 def train_with_signal(
     world: Path, out: Path, stage: str, number: int
 ) -> tuple[int | None, Printed]:
-    """Train in a process of its own, which gets a signal after the first epoch.
-
-    Returns:
-        Its exit code, and what it has printed.
-    """
+    """Train in a process that gets a signal after an epoch; return its exit code and output."""
     printed = Printed(out.with_name(f"printed by {out.name}"))
     words = [*map(str, train_arguments(world, out)), "--stage", stage]
     process = fork_server().Process(target=train_until_signal, args=(words, printed, number))

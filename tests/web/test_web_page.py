@@ -229,10 +229,7 @@ def plain(
 
 
 def reference(path: Path, weights: str | Path, graphs: Path) -> tuple[np.ndarray, Verdict]:
-    """Return the raw ids of a scan that is normalised as in `predict`, and the verdict on them.
-
-    They are by `onnx_runner.py`.
-    """
+    """Return raw ids of a scan by `onnx_runner.py`, normalised as in `predict`, and the verdict."""
     loaded = load(weights)
     normaliser = Normaliser(loaded.expects)
     cloud = read_file(path, ending_of(path), UNKNOWN)

@@ -52,11 +52,7 @@ def change(tree: Any, path: str, value: Any) -> Any:
 
 
 def places(tree: Any, kind: type, path: str = "") -> Iterator[str]:
-    """Yield the places of the values of a type, each a path of keys separated by spaces.
-
-    Of a list, only the first value counts. Integers that are 0 are left out, because 0 is allowed
-    in their places.
-    """
+    """Yield the keys, with spaces between, of values of a type, but of 0, which is allowed."""
     if isinstance(tree, dict):
         for key, value in tree.items():
             yield from places(value, kind, f"{path} {key}".strip())

@@ -32,11 +32,7 @@ WEIGHTS = fresh_weights()
 
 
 class Exports:
-    """Stands in for `export`: writes small files, and counts.
-
-    Attributes:
-        contents: the content of every graph that the next export writes.
-    """
+    """Stands in for `export`: writes small files with `contents` for every graph, and counts."""
 
     def __init__(self) -> None:
         self.count = 0

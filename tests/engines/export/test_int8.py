@@ -1,7 +1,4 @@
-"""Graphs in int8 hold integers, are calibrated as asked, and keep nearly all labels.
-
-Skipped without ONNX Runtime.
-"""
+"""Graphs in int8 hold integers, are calibrated as asked, and keep nearly all labels."""
 
 from __future__ import annotations
 

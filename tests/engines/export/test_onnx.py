@@ -1,7 +1,4 @@
-"""Exported graphs say what torch says, and the runner needs no torch.
-
-Skipped without ONNX Runtime.
-"""
+"""Exported graphs say what torch says, and the runner needs no torch."""
 
 from __future__ import annotations
 
