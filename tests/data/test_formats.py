@@ -605,8 +605,7 @@ def test_the_topic_is_found_or_asked_for(tmp_path: Path) -> None:
 
 
 def test_a_bag_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "drive"
-    write_bag2(path, {"/lidar": [some_points()] * 3}, StoragePlugin.MCAP)
+    path = write_bag2(tmp_path / "drive", {"/lidar": [some_points()] * 3}, StoragePlugin.MCAP)
     metadata = path / "metadata.yaml"
     text = metadata.read_text()
 

@@ -88,8 +88,7 @@ def test_a_broken_file_gives_a_scan_or_an_error_of_one_line(
     file = tmp_path / name
     scan_path = file
     if name == METADATA:
-        scan_path = tmp_path / "drive"
-        write_bag2(scan_path, {"/lidar": [some_points()]}, StoragePlugin.MCAP)
+        scan_path = write_bag2(tmp_path / "drive", {"/lidar": [some_points()]}, StoragePlugin.MCAP)
 
     @settings(
         max_examples=cases,

@@ -52,8 +52,7 @@ DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, no_gpu])]
 @pytest.fixture(scope="module")
 def simulated_scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
     """Simulate a scan of an HDL-64E with nothing large beside the sensor."""
-    folder = tmp_path_factory.mktemp("streets")
-    simulate(folder, scans=1, seed=4)
+    folder = simulate(tmp_path_factory.mktemp("streets"), scans=1, seed=4)
     return read_scan(folder / "sequences/00/velodyne/000000.bin")
 
 

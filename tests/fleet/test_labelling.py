@@ -167,8 +167,7 @@ def test_a_scan_that_is_gone_is_a_broken_one(labelling: LabellingRequest, tmp_pa
 def test_a_scan_in_the_output_is_not_replaced(labelling: LabellingRequest, tmp_path: Path) -> None:
     """In a pipeline of one's own, nobody has listed the scans."""
     points, _ = street(0)
-    path = tmp_path / "a.ply"
-    write_ply(path, points)
+    path = write_ply(tmp_path / "a.ply", points)
     before = path.read_bytes()
     worker = LabelScans(replace(labelling, files=LabelFiles("ply")), str(tmp_path))
     (row,) = worker(pa.table({"path": [str(path)]})).to_pylist()

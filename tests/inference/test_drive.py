@@ -291,8 +291,7 @@ def test_poses_that_were_turned_by_a_calibration_say_so(world: Path, tmp_path: P
     find_poses(scans, of_lidar, report=lines.append)
     assert lines[-1].endswith("by the file, as the LiDAR's, without calib.txt beside it")
 
-    kitti = tmp_path / "00.txt"
-    shutil.copy(world / "data/sequences/00/poses.txt", kitti)
+    kitti = shutil.copy(world / "data/sequences/00/poses.txt", tmp_path / "00.txt")
     fails(lambda: find_poses(scans, kitti), "00.txt", "without calib.txt", "apart")
     shutil.copy(world / "data/sequences/00/calib.txt", tmp_path)
     find_poses(scans, kitti, report=lines.append)

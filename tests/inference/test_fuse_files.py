@@ -305,8 +305,7 @@ def head(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.full
 def test_a_head_for_files_is_that_of_networks(world: Path, head: Path, tmp_path: Path) -> None:
     # Without the world's head, which would be trained further
-    networks = tmp_path / "networks.safetensors"
-    save(without(fresh_weights(), "point_head"), networks)
+    networks = save(without(fresh_weights(), "point_head"), tmp_path / "networks.safetensors")
     assert run_cli(*[*train_head_arguments(world, tmp_path / "run"), "--init", networks]) == (0, "")
 
     from_networks = load(tmp_path / "run")

@@ -98,8 +98,7 @@ def settings_of(world: Path) -> dict[str, object]:
 
 
 def test_broken_scans_are_listed_others_labelled(world: Path, whole: Path, tmp_path: Path) -> None:
-    scans = tmp_path / "scans"
-    shutil.copytree(world / "scans", scans)
+    scans = shutil.copytree(world / "scans", tmp_path / "scans")
     (scans / "000003.bin").write_bytes(b"123")
     (scans / "000007.bin").write_bytes(b"")
 
@@ -234,8 +233,7 @@ def test_the_output_is_checked_before_the_networks_are_loaded_and_when_the_run_i
 
 def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_path: Path) -> None:
     """Neither a finished nor an interrupted run is; the line says which option differs."""
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
+    out = shutil.copytree(whole, tmp_path / "out")
     other = save(fresh_weights(seed=1), tmp_path / "other.safetensors")
     for options, key in (
         ("--method rv", "method"),
@@ -300,8 +298,7 @@ def grow(folder: Path, seeds: Iterable[int]) -> set[str]:
 
 
 def test_a_finished_run_makes_only_lost_labels(world: Path, whole: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
+    out = shutil.copytree(whole, tmp_path / "out")
     command = predict(world, out, "--resume")
     times = times_of(out)
     succeed(command)
@@ -314,8 +311,7 @@ def test_a_finished_run_makes_only_lost_labels(world: Path, whole: Path, tmp_pat
 
 
 def test_a_run_repeats_scans_and_keeps_the_others(world: Path, whole: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
+    out = shutil.copytree(whole, tmp_path / "out")
     succeed(f"predict {world}/scans/000003.bin --weights {world}/{WEIGHTS} --out {out} --overwrite")
     times = times_of(out)
     succeed(predict(world, out, "--resume"))
@@ -339,8 +335,7 @@ def test_a_scan_that_lacks_one_of_its_files_is_segmented_again(world: Path, tmp_
 
 def test_scans_before_the_first_normalise_all(world: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    scans = tmp_path / "scans"
-    shutil.copytree(world / "scans", scans)
+    scans = shutil.copytree(world / "scans", tmp_path / "scans")
     (scans / "000000.bin").unlink()
     command = f"predict {scans} --weights {world}/{WEIGHTS} --out {out} --resume"
     succeed(command)
@@ -351,8 +346,7 @@ def test_scans_before_the_first_normalise_all(world: Path, whole: Path, tmp_path
 
 def test_a_scan_that_was_rewritten_is_segmented_again(world: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    scans = tmp_path / "scans"
-    shutil.copytree(world / "scans", scans)
+    scans = shutil.copytree(world / "scans", tmp_path / "scans")
     command = f"predict {scans} --weights {world}/{WEIGHTS} --out {out} --resume"
     succeed(command)
 
@@ -365,8 +359,7 @@ def test_a_scan_that_was_rewritten_is_segmented_again(world: Path, tmp_path: Pat
 
 def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) -> None:
     """A folder grows while a scan is still being copied."""
-    scans = tmp_path / "scans"
-    shutil.copytree(world / "scans", scans)
+    scans = shutil.copytree(world / "scans", tmp_path / "scans")
     (scans / "000008.bin").write_bytes(b"123")
     command = f"predict {scans} --weights {world}/{WEIGHTS} --out {tmp_path}/out --resume"
     assert run_cli(*command.split())[0] == 3

@@ -127,9 +127,8 @@ def make_cloud(points: np.ndarray, ring: np.ndarray | None = None) -> Cloud:
 
 def assert_alike(a: Scan, b: Scan, atol: float = 1e-4) -> None:
     np.testing.assert_allclose(a.points, b.points, atol=atol)
-    assert (
-        np.mean(not_none(a.row) == not_none(b.row)) > 0.99
-    )  # all but points at the border of two rows
+    # All but points at the border of two rows.
+    assert np.mean(not_none(a.row) == not_none(b.row)) > 0.99
 
 
 @pytest.mark.parametrize("height", [0.6, 1.73, 2.6])
@@ -192,16 +191,10 @@ def test_a_scan_knows_the_way_back_from_what_was_measured(unit: str) -> None:
 
 
 def test_rotations_are_yaw_pitch_and_roll() -> None:
-    forward = np.array([1, 0, 0])
-    left = np.array([0, 1, 0])
-    up = np.array([0, 0, 1])
-    yaw = rotation_from_degrees(90, 0, 0)
-    pitch = rotation_from_degrees(0, 90, 0)
-    roll = rotation_from_degrees(0, 0, 90)
-
-    np.testing.assert_allclose(yaw @ forward, left, atol=1e-12)
-    np.testing.assert_allclose(pitch @ forward, -up, atol=1e-12)
-    np.testing.assert_allclose(roll @ left, up, atol=1e-12)
+    forward, left, up = np.eye(3)
+    np.testing.assert_allclose(rotation_from_degrees(90, 0, 0) @ forward, left, atol=1e-12)
+    np.testing.assert_allclose(rotation_from_degrees(0, 90, 0) @ forward, -up, atol=1e-12)
+    np.testing.assert_allclose(rotation_from_degrees(0, 0, 90) @ left, up, atol=1e-12)
 
 
 @pytest.mark.parametrize("axes", lidars.AXES.values())
@@ -596,8 +589,7 @@ def test_mistakes_are_one_line(mistake: str, world: Path, tmp_path: Path) -> Non
 
 
 def test_scans_of_datasets_are_not_normalised(tmp_path: Path) -> None:
-    weights = tmp_path / "w.safetensors"
-    save(trained_for(WEIGHTS, "hdl64e"), weights)
+    weights = save(trained_for(WEIGHTS, "hdl64e"), tmp_path / "w.safetensors")
     data = make_streets(tmp_path / "data", ("00",), 1)
     path = data / "sequences/00/velodyne/000000.bin"
     points = np.fromfile(path, np.float32).reshape(-1, 4)

@@ -146,8 +146,7 @@ def test_two_datasets_with_a_sequence_of_one_name_are_two_drives(tmp_path: Path)
 def test_a_finished_run_is_resumed_and_another_one_refused(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(world / "run", out)
+    out = shutil.copytree(world / "run", tmp_path / "run")
     refused(command(world, out), "--resume")
     shutil.copytree(out / "teacher", tmp_path / "begun/teacher")  # stopped before the training
     refused(command(world, tmp_path / "begun"), "--resume")
@@ -181,8 +180,7 @@ def test_a_folder_of_something_else_stays_as_it_was(world: Path, tmp_path: Path)
 def test_weights_that_are_no_surer_stay_as_they_were(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(world / "run", out)
+    out = shutil.copytree(world / "run", tmp_path / "run")
     monkeypatch.setattr(Figures, "is_better_than", lambda self, other: False)
     succeed(command(world, out, "--resume", "--seed", 0))  # the default seed
     assert load(out).digests() == load(world / "w.safetensors").digests()
@@ -238,8 +236,7 @@ def test_streets_need_a_sensor_that_can_be_simulated(world: Path, tmp_path: Path
 def test_weights_need_both_networks_and_a_head(world: Path, tmp_path: Path) -> None:
     weights = load(world / "w.safetensors")
     tensors = {name: t for name, t in weights.tensors.items() if not name.startswith("range_net")}
-    path = tmp_path / "w.safetensors"
-    save(replace(weights, tensors=tensors), path)
+    path = save(replace(weights, tensors=tensors), tmp_path / "w.safetensors")
     line = command(world, tmp_path / "run").replace(f"{world}/w.safetensors", str(path))
     refused(line, "found no range_net; train that part")
 

@@ -113,8 +113,7 @@ def test_a_run_that_cannot_begin_leaves_no_folder(world: Path, tmp_path: Path) -
 
 @pytest.mark.full
 def test_resume_removes_what_killed_runs_left_half_written(world: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(world / "run", out)
+    out = shutil.copytree(world / "run", tmp_path / "run")
     part = f".{32 * '0'}.part"  # begins the names that `atomic_write` gives
     for name in (f"{part}.yaml", f"rv/{part}.ckpt", f"bev/{part}.safetensors", "rv/.my.part"):
         (out / name).write_bytes(b"half")
@@ -128,8 +127,7 @@ def test_resume_removes_what_killed_runs_left_half_written(world: Path, tmp_path
 
 
 def test_truncated_weights_of_a_finished_run_are_made_again(world: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(world / "run", out)
+    out = shutil.copytree(world / "run", tmp_path / "run")
     path = out / "weights.safetensors"
     path.write_bytes(path.read_bytes()[:1000])
     succeed(command(world, out, "--resume"))

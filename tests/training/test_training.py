@@ -414,8 +414,7 @@ def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
 
 
 def test_a_broken_label_file_is_one_line_from_a_worker_too(world: Path, tmp_path: Path) -> None:
-    data = tmp_path / "data"
-    shutil.copytree(world / "data", data)
+    data = shutil.copytree(world / "data", tmp_path / "data")
     np.full(499, CAR, np.uint32).tofile(data / "sequences/00/labels/000001.label")  # of 500 points
 
     options = ("--stage", "rv", "--training.rv.class_weights", 0, "--training.workers", 1)
@@ -439,8 +438,7 @@ def test_resuming_a_finished_run_changes_nothing(world: Path, run: Path, tmp_pat
 
 @pytest.mark.full
 def test_a_finished_stage_needs_no_checkpoint(world: Path, run: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(run, out)
+    out = shutil.copytree(run, tmp_path / "run")
     for stage in PART_OF:
         (out / stage / "last.ckpt").unlink()
     before = contents(out)
@@ -751,8 +749,7 @@ def test_a_full_disk_is_one_line_and_keeps_weights(world: Path, tmp_path: Path, 
 @pytest.mark.full
 def test_a_run_that_fails_is_one_line_and_keeps_its_stages(world: Path, tmp_path: Path) -> None:
     """The notes of libraries stay out of stderr, which only a process of its own shows."""
-    data = tmp_path / "data"
-    shutil.copytree(world / "data", data)
+    data = shutil.copytree(world / "data", tmp_path / "data")
     arguments = ["train", world / "recipe.yaml", "--data", data, "--out", tmp_path / "run"]
     assert run_cli(*arguments, "--stage", "rv") == (0, "")
 
