@@ -175,8 +175,7 @@ def test_a_recipe_counts_wherever_it_stands(
     succeed(f"train {recipe} {options}" if order == "first" else f"train {options} {recipe}")
 
     (plan,) = plans
-    assert plan.recipe.model.range_view.width == 64
-    assert plan.recipe.training.rv.epochs == 3
+    assert (plan.recipe.model.range_view.width, plan.recipe.training.rv.epochs) == (64, 3)
 
 
 # ---- predict
@@ -196,8 +195,7 @@ def test_scores_are_probabilities_of_both_networks_as_float16(world: Path, tmp_p
         assert set(arrays.files) == {"rv", "bev"}
         for name, probabilities in (("rv", result.rv), ("bev", result.bev)):
             assert probabilities is not None
-            assert arrays[name].dtype == np.float16
-            assert arrays[name].shape == (500, 19)
+            assert (arrays[name].dtype, arrays[name].shape) == (np.float16, (500, 19))
             assert np.array_equal(arrays[name], probabilities.astype(np.float16))
 
 
@@ -315,8 +313,7 @@ def test_bench_figures_add_up(world: Path, tmp_path: Path, monkeypatch: pytest.M
     options = f"--scan {world}/lone.bin --runs 3 --json {tmp_path}/b.json"
     succeed(f"bench --weights {world}/w.safetensors {options}")
     figures = read_json(tmp_path / "b.json")
-    assert figures["points"] == 300
-    assert figures["runs"] == 3
+    assert (figures["points"], figures["runs"]) == (300, 3)
     assert figures["peak_memory_mib"] > 100
 
     medians = {}

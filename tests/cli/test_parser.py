@@ -93,8 +93,7 @@ def test_a_file_whose_name_looks_like_an_option_is_told_how_to_be_given(
 def test_values_that_begin_with_a_minus_need_no_equals_sign() -> None:
     words = "a --weights w --offset -1,0,0 --resume --height -.5 --out o"
     values = make_parser("predict", COMMANDS["predict"]).values(words.split())
-    assert values["offset"] == "-1,0,0"
-    assert values["height"] == -0.5
+    assert (values["offset"], values["height"]) == ("-1,0,0", -0.5)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

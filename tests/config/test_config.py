@@ -169,9 +169,7 @@ def test_a_users_file_may_build_on_another_users_file(tmp_path: Path) -> None:
     second = write_recipe(tmp_path, f"base: {first}\ntraining: {{seed: 6}}")
 
     training = load_recipe(second).training
-    assert training.seed == 6
-    assert training.workers == 2
-    assert training.rv.epochs == 400
+    assert (training.seed, training.workers, training.rv.epochs) == (6, 2, 400)
 
 
 @pytest.mark.parametrize(

@@ -424,8 +424,7 @@ def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
     batch = PointBatch.of(scans)
 
     expected = [slice(0, 100), slice(100, 200), slice(200, 302)]
-    assert batch.slices == expected
-    assert batch.to("cpu").slices == expected
+    assert (batch.slices, batch.to("cpu").slices) == (expected, expected)
     assert PointBatch(batch.points, batch.scan, 3).slices == expected
 
 

@@ -120,8 +120,7 @@ def test_onnx_takes_the_fastest_provider_that_is_installed_and_int8_the_cpu(
 
     engine = OnnxEngine(WEIGHTS, networks, int8=True)
     assert opened[-2:] == [[CPU], [CPU]]
-    assert engine.name == "int8"
-    assert engine.hardware == "cpu"
+    assert (engine.name, engine.hardware) == ("int8", "cpu")
 
 
 @pytest.mark.full

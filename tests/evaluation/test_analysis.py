@@ -124,8 +124,7 @@ def test_points_that_no_network_sees_count_as_evaluate_counts_them(
     assert set(expected.matrices) - set(evaluation.matrices) == {"rv-knn"}
     for method, matrices in evaluation.matrices.items():
         np.testing.assert_array_equal(matrices, expected.matrices[method])
-    assert evaluation.points == expected.points
-    assert evaluation.uncertain == expected.uncertain
+    assert (evaluation.points, evaluation.uncertain) == (expected.points, expected.uncertain)
 
     _, uncertain, _, _ = analyzed.sweep()[round(weights.model.assertion.threshold * BINS)]
     assert uncertain == pytest.approx(100 * expected.uncertain / expected.points, abs=0.5)

@@ -54,8 +54,7 @@ def test_semantickitti_equals_the_official_tools() -> None:
     assert len(figures["by_distance"]) == len(expected["by_distance"])
     for ours, theirs in zip(figures["by_distance"], expected["by_distance"], strict=True):
         assert_same_figures(ours, theirs)
-        assert ours["from_m"] == round(theirs["from_m"])
-        assert ours["to_m"] == theirs["to_m"]
+        assert (ours["from_m"], ours["to_m"]) == (round(theirs["from_m"]), theirs["to_m"])
         assert ours["points"] > 0
 
 
@@ -167,9 +166,7 @@ def test_report_has_the_keys_of_the_contract() -> None:
     report = evaluate(example).report("nuscenes:here")
 
     assert list(report) == ["dataset", "scans", "points", "uncertain_fraction", "methods"]
-    assert report["dataset"] == "nuscenes:here"
-    assert report["scans"] == 1
-    assert report["points"] == 500
+    assert (report["dataset"], report["scans"], report["points"]) == ("nuscenes:here", 1, 500)
     assert report["uncertain_fraction"] == pytest.approx(example.uncertain.mean())
 
     figures = {"miou", "miou_present", "accuracy", "fwiou", "iou"}

@@ -185,8 +185,7 @@ def test_a_whole_thing_is_more_doubtful_than_the_edge_of_one_and_many_points_tha
     rows = find_clusters(doubts_of(points, ids, ids, labels))
 
     rows = rows[np.argsort(-rows["score"])]
-    assert rows["points"][0] == 100
-    assert rows["points"][-1] == 1
+    assert (rows["points"][0], rows["points"][-1]) == (100, 1)
     assert rows["score"][0] > 2 * rows["score"][1]
 
 

@@ -240,8 +240,7 @@ def test_files_are_read_and_detected_once(tmp_path: Path, monkeypatch: pytest.Mo
 
     for name in names:
         times = 2 if name == "0.bin" else 1  # 0.bin is in both runs
-        assert counts[f"read {name}"] == times
-        assert counts[f"detect {name}"] == times
+        assert (counts[f"read {name}"], counts[f"detect {name}"]) == (times, times)
 
 
 # ---- rows

@@ -46,8 +46,7 @@ def read_ply(path: Path) -> LabelFile:
     assert file.byte_order == "<"
 
     vertex = file["vertex"].data
-    assert vertex.dtype["red"].str == "|u1"
-    assert vertex.dtype["class"].str == "<i4"
+    assert (vertex.dtype["red"].str, vertex.dtype["class"].str) == ("|u1", "<i4")
 
     xyz = np.stack([vertex["x"], vertex["y"], vertex["z"]], axis=1)
     colors = np.stack([vertex["red"], vertex["green"], vertex["blue"]], axis=1)

@@ -159,8 +159,7 @@ def test_a_sensor_of_a_yaml_file_is_simulated(tmp_path: Path, quick: None) -> No
 
 def test_a_known_sensor_is_simulated_at_another_height() -> None:
     lidar = simulated_lidar(make_sensor("pandar64", height=2.2))
-    assert lidar.height == 2.2
-    assert lidar.height_spread == 0
+    assert (lidar.height, lidar.height_spread) == (2.2, 0)
     assert lidar.elevations == LIDAR_MODELS["pandar64"].elevations
     assert simulated_lidar(make_sensor("hdl64e")) is LIDAR_MODELS["hdl64e"]
 

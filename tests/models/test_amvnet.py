@@ -170,8 +170,7 @@ def test_with_fewer_points_than_neighbours_the_last_one_is_repeated() -> None:
 @pytest.mark.parametrize("points", [0, 5])
 def test_without_an_uncertain_point_there_are_no_neighbours(points: int) -> None:
     nearest = nearest_neighbours(torch.randn(points, 4), torch.zeros(0, dtype=torch.long), 3)
-    assert nearest.shape == (0, 3)
-    assert nearest.dtype == torch.int32
+    assert (nearest.shape, nearest.dtype) == ((0, 3), torch.int32)
 
 
 def head_features_by_loop(

@@ -209,8 +209,7 @@ def test_the_diagnostics_tell_latency_and_counts(start: Start) -> None:
     status = report(node)
     values = {value.key: value.value for value in status.values}
     assert status.hardware_id == "cpu"
-    assert values["clouds received"] == "1"
-    assert values["stamp to labels (ms)"] == "1500"
+    assert (values["clouds received"], values["stamp to labels (ms)"]) == ("1", "1500")
     assert float(values["latency (ms)"]) > 0
 
 
@@ -247,8 +246,7 @@ def test_clouds_have_the_quality_of_service_of_sensor_data(start: Start) -> None
     node = start()
     _, qos = node.callbacks["points"]
     for profile in (qos, node.publishers["~/labels"].qos, node.publishers["~/cloud"].qos):
-        assert profile.reliability == "best_effort"
-        assert profile.history == "keep_last"
+        assert (profile.reliability, profile.history) == ("best_effort", "keep_last")
         assert profile.depth == 1
 
 

@@ -185,8 +185,7 @@ def test_a_raised_road_is_not_upside_down() -> None:
     road = np.column_stack([x, y, -1.7 - 0.25 * np.maximum(np.abs(y) - 8, 0)])
     trees = rng.uniform((25, -60, -1), (70, 60, 6), (50_000, 3))
     frame = find_frame(np.concatenate([road, trees]), Sensor())
-    assert frame.axes == "x-forward"
-    assert frame.height == pytest.approx(1.7, abs=0.05)
+    assert (frame.axes, frame.height) == ("x-forward", pytest.approx(1.7, abs=0.05))
 
 
 @pytest.mark.parametrize("tilt", first_of([(8, 0), (0, 8)]))

@@ -190,8 +190,7 @@ def test_the_weights_describe_their_training(run: Path) -> None:
     weights = load(run / "weights.safetensors")
     for part in PARTS:
         training = weights.training[part]
-        assert training["sequences"] == ["00", "01"]
-        assert training["validated_on"] == ["08"]
+        assert (training["sequences"], training["validated_on"]) == (["00", "01"], ["08"])
         assert training["seed"] == 0
     assert weights.training["range_net"]["rv"]["epochs"] == 3
     assert weights.model.range_view.width == 64
@@ -206,11 +205,8 @@ def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: P
     weights = train(world, tmp_path / "run", "--stage", "rv", *epochs, *decoder, *seed)
 
     training = weights.training["range_net"]
-    assert training["rv"]["epochs"] == 1
-    assert training["seed"] == 7
-    assert training["rv"]["lr"] == 0.02
-    assert weights.model.range_net.decoder == 24
-    assert weights.parts == ("range_net",)
+    assert (training["rv"]["epochs"], training["seed"], training["rv"]["lr"]) == (1, 7, 0.02)
+    assert (weights.model.range_net.decoder, weights.parts) == (24, ("range_net",))
     recipe = yaml.safe_load((tmp_path / "run/recipe.yaml").read_text())
     assert recipe["training"]["rv"]["epochs"] == 1
 
@@ -572,8 +568,7 @@ def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
 
     monkeypatch.setattr(KeepWeights, "on_train_epoch_end", watch)
     weights = train(world, tmp_path / "run", "--model.assertion.threshold", 0)
-    assert weights.parts == PARTS
-    assert weights.usual_uncertain == 0
+    assert (weights.parts, weights.usual_uncertain) == (PARTS, 0)
 
     # The figure of the head is AMVNet's: the ensemble's wherever the networks agree.
     expected = scored(world, tmp_path, tmp_path / "run")["methods"]["amvnet"]["miou"]
@@ -651,8 +646,7 @@ def test_a_run_of_several_calls_records_what_each_trained_on(world: Path, tmp_pa
     records = yaml.safe_load((tmp_path / "run.yaml").read_text())
     trained = {name: record["train"] for name, record in records.items()}
     assert trained == {"rv": ["00"], "bev": ["01"]}
-    assert records["rv"]["val"] == ["08"]
-    assert records["rv"]["versions"]["torch"] == torch.__version__
+    assert (records["rv"]["val"], records["rv"]["versions"]["torch"]) == (["08"], torch.__version__)
 
 
 def train_until_signal(words: list[str], printed: Printed, number: int) -> None:

@@ -79,8 +79,7 @@ def test_corrected_labels_are_saved_in_the_form_of_their_place(
     path = tmp_path / f"b.{ending}"
     path.write_bytes(bytes.fromhex(state["title"]))
     np.testing.assert_array_equal(read_raw_labels(path, 2000, missing=0), raw)
-    assert state["console"] == []
-    assert state["drawn"][PERSON] == in_box(page).sum()
+    assert (state["console"], state["drawn"][PERSON]) == ([], in_box(page).sum())
 
 
 def test_a_download_is_named_as_in_its_data(page: Path, tmp_path: Path, browser: Browser) -> None:

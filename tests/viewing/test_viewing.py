@@ -276,8 +276,7 @@ def test_names_stay_names(tmp_path: Path) -> None:
     harmless = write_and_read(tmp_path / "q.html", make_scan(street(5)[0]))
 
     assert tags(page) == tags(harmless)
-    assert page.texts["<title>"] == HOSTILE
-    assert page.about["title"] == HOSTILE
+    assert (page.texts["<title>"], page.about["title"]) == (HOSTILE, HOSTILE)
     assert page.about["classes"][1] == HOSTILE
     assert page.about["table"] is not None
     assert page.about["scans"][0]["name"] == HOSTILE
@@ -299,8 +298,7 @@ def view_page(tmp_path: Path, *arguments: object) -> Page:
 
 def test_a_lone_scan_needs_nothing_else(world: Path, tmp_path: Path) -> None:
     page = view_page(tmp_path, world / "lone.bin")
-    assert page.about["scans"][0]["planes"] == ["intensity"]
-    assert page.about["sources"] == []
+    assert (page.about["scans"][0]["planes"], page.about["sources"]) == (["intensity"], [])
     assert page.texts["<title>"] == "lone.bin"
 
 
@@ -509,8 +507,7 @@ def test_the_browser_hides_classes(path: Path, browser: Browser) -> None:
     hidden = np.unique(planes["rv"])[:2].tolist()
     state = browser.state(path, f"color=error&labels=rv&hide={hidden[0]},{hidden[1]}")
 
-    assert state["data-color"] == "error"
-    assert state["drawn"] == count_by_class(planes["rv"], hidden)
+    assert (state["data-color"], state["drawn"]) == ("error", count_by_class(planes["rv"], hidden))
 
 
 @pytest.mark.full
@@ -536,8 +533,7 @@ def test_the_browser_draws_only_wrong_or_uncertain_points(path: Path, browser: B
     uncertain = planes["uncertain"] > 0
     state = browser.state(path, "scan=4&labels=truth&only=uncertain&color=height")
 
-    assert state["data-scan"] == "3"
-    assert state["drawn"] == count_by_class(planes["truth"][uncertain])
+    assert (state["data-scan"], state["drawn"]) == ("3", count_by_class(planes["truth"][uncertain]))
 
 
 @pytest.mark.full

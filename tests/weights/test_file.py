@@ -82,8 +82,7 @@ def test_the_description_can_be_read_without_this_package(weights: Weights, path
     assert names == set(weights.tensors)
     assert description["model"] == to_dict(weights.model)
     assert description["taxonomy"]["classes"] == list(SEMANTICKITTI.classes)
-    assert description["sensor"] == weights.sensor
-    assert description["training"] == weights.training
+    assert (description["sensor"], description["training"]) == (weights.sensor, weights.training)
     assert description["metrics"] == weights.metrics
 
 

@@ -129,8 +129,7 @@ def test_the_card_says_what_the_hub_and_people_need(hub: Hub) -> None:
     _, front_matter, card = (hub.root / "somebody/streets/README.md").read_text().split("---\n", 2)
 
     metadata = yaml.safe_load(front_matter)
-    assert metadata["license"] == "cc-by-nc-sa-4.0"
-    assert metadata["library_name"] == "amvnet"
+    assert (metadata["license"], metadata["library_name"]) == ("cc-by-nc-sa-4.0", "amvnet")
 
     assert f'amvnet.load("{NAME}")' in card
     assert "traffic-sign" in card

@@ -49,8 +49,7 @@ def test_replacing_a_part_changes_only_that_part(weights: Weights, part: str) ->
 
 def test_a_part_brings_its_sizes(weights: Weights) -> None:
     mixed = replace_part(weights, "range_net", with_model(weights, "range_view", width=128))
-    assert mixed.model.range_view.width == 128
-    assert mixed.model.polar_view == weights.model.polar_view
+    assert (mixed.model.range_view.width, mixed.model.polar_view) == (128, weights.model.polar_view)
 
 
 def test_networks_and_head_of_two_files_add_up(weights: Weights) -> None:
