@@ -51,6 +51,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def npy(tmp_path: Path) -> Path:
+    return tmp_path / "a.npy"
+
+
+@pytest.fixture
+def pcd(tmp_path: Path) -> Path:
+    return tmp_path / "a.pcd"
+
+
 # --- every format ---
 
 
@@ -102,12 +112,11 @@ def test_a_truncated_file_is_refused(folder: Path, tmp_path: Path, name: str) ->
 # --- variants of PCD ---
 
 
-def test_comments_of_a_header_may_hold_any_bytes(tmp_path: Path) -> None:
-    path = tmp_path / "a.pcd"
+def test_comments_of_a_header_may_hold_any_bytes(pcd: Path) -> None:
     content = pcd_bytes(some_points().view(scan_writers.FLOATS), FLOAT_FIELDS)
     for comment in (b"# M\xfcller \xff\xfe\x80\n", "# 点群\n".encode()):
-        path.write_bytes(content.replace(b"VERSION", comment + b"VERSION", 1))
-        np.testing.assert_array_equal(read_scan(path).points, some_points())
+        pcd.write_bytes(content.replace(b"VERSION", comment + b"VERSION", 1))
+        np.testing.assert_array_equal(read_scan(pcd).points, some_points())
 
 
 def fill_coordinates(table: np.ndarray, points: np.ndarray) -> None:
@@ -116,8 +125,7 @@ def fill_coordinates(table: np.ndarray, points: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("size", [4, 8])
-def test_columns_of_any_order_type_and_padding_are_read(tmp_path: Path, size: int) -> None:
-    path = tmp_path / "a.pcd"
+def test_columns_of_any_order_type_and_padding_are_read(pcd: Path, size: int) -> None:
     points = some_points()
     ring = np.arange(60) % 16
     intensity = np.round(points[:, 3] * 255)
@@ -139,9 +147,9 @@ def test_columns_of_any_order_type_and_padding_are_read(tmp_path: Path, size: in
         ("ring", "U 2", 1),
         ("intensity", "U 1", 1),
     ]
-    path.write_bytes(pcd_bytes(table, fields))
+    pcd.write_bytes(pcd_bytes(table, fields))
 
-    scan = read_scan(path)
+    scan = read_scan(pcd)
     np.testing.assert_array_equal(scan.points[:, :3], points[:, :3])
     np.testing.assert_allclose(scan.points[:, 3], intensity / 255, rtol=1e-6)
     np.testing.assert_array_equal(scan.ring, ring)
@@ -161,50 +169,47 @@ def test_columns_of_other_types_are_read_in_every_encoding(tmp_path: Path, encod
     np.testing.assert_array_equal(scan.ring, ring)
 
 
-def test_lost_points_of_an_organised_cloud_keep_their_index(tmp_path: Path) -> None:
+def test_lost_points_of_an_organised_cloud_keep_their_index(pcd: Path) -> None:
     points = some_points()
     points[3, :3] = np.nan
     points[7] = 0
     points[9, 0] = np.inf
-    path = tmp_path / "a.pcd"
-    path.write_bytes(pcd_bytes(points.view(scan_writers.FLOATS), FLOAT_FIELDS, height=4))
+    pcd.write_bytes(pcd_bytes(points.view(scan_writers.FLOATS), FLOAT_FIELDS, height=4))
 
-    scan = read_scan(path)
+    scan = read_scan(pcd)
     assert np.flatnonzero(~scan.valid).tolist() == [3, 7, 9]
     np.testing.assert_array_equal(scan.points[scan.valid], points[scan.valid])
 
 
-def test_ascii_is_read_with_any_white_space_and_nan(tmp_path: Path) -> None:
-    path = tmp_path / "a.pcd"
+def test_ascii_is_read_with_any_white_space_and_nan(pcd: Path) -> None:
     header = "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 4\nHEIGHT 1\n"
     lines = "1 2 3 0.5\r\n\t4   5 6\t1\n\nnan nan nan nan\n-1e0 .5 +2 0"
-    path.write_text(f"{header}DATA ascii\n{lines}")
+    pcd.write_text(f"{header}DATA ascii\n{lines}")
 
-    scan = read_scan(path)
+    scan = read_scan(pcd)
     assert scan.points[[0, 1, 3]].tolist() == [[1, 2, 3, 0.5], [4, 5, 6, 1], [-1, 0.5, 2, 0]]
     assert scan.valid.tolist() == [True, True, False, True]
 
 
-def test_the_first_value_of_a_column_of_several_is_used(tmp_path: Path) -> None:
+def test_the_first_value_of_a_column_of_several_is_used(pcd: Path) -> None:
     points = some_points()
-    path = tmp_path / "a.pcd"
     header = "FIELDS normal x y z intensity\nSIZE 4 4 4 4 4\nTYPE F F F F F\nCOUNT 3 2 1 1 1\n"
     header += "POINTS 60\nDATA {}\n"
     others = np.full((60, 3), 7, np.float32)
     columns = [others, np.column_stack([points[:, 0], others[:, 0]]), *points[:, 1:].T]
     rows = np.column_stack(columns)
 
-    np.savetxt(path, rows, "%.4f", header=header.format("ascii").strip(), comments="")
-    np.testing.assert_allclose(read_scan(path).points, points, atol=1e-4)
+    np.savetxt(pcd, rows, "%.4f", header=header.format("ascii").strip(), comments="")
+    np.testing.assert_allclose(read_scan(pcd).points, points, atol=1e-4)
 
-    path.write_bytes(header.format("binary").encode() + rows.astype(np.float32).tobytes())
-    np.testing.assert_array_equal(read_scan(path).points, points)
+    pcd.write_bytes(header.format("binary").encode() + rows.astype(np.float32).tobytes())
+    np.testing.assert_array_equal(read_scan(pcd).points, points)
 
     data = b"".join(column.astype(np.float32).tobytes() for column in columns)
     packed = lzf.compress(data, 2 * len(data))
     sizes = struct.pack("<II", len(packed), len(data))
-    path.write_bytes(header.format("binary_compressed").encode() + sizes + packed)
-    np.testing.assert_array_equal(read_scan(path).points, points)
+    pcd.write_bytes(header.format("binary_compressed").encode() + sizes + packed)
+    np.testing.assert_array_equal(read_scan(pcd).points, points)
 
 
 def test_lzf_is_unpacked_if_it_has_the_size_that_is_stated() -> None:
@@ -224,10 +229,9 @@ def test_lzf_is_unpacked_if_it_has_the_size_that_is_stated() -> None:
     [b"\x05ab", b"\x20\x00", b"\x00a\x20\x01", b"\x00a\x20", b"\x00a\xe0\x05"],
     ids=["literal cut off", "nothing to repeat", "before the first", "no distance", "no end"],
 )
-def test_broken_lzf_is_an_error_of_one_line(data: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "a.pcd"
-    path.write_bytes(_pcd(1, "binary_compressed", struct.pack("<II", len(data), 12) + data))
-    fails(partial(read_scan, path), path, "expected a PCD file, found a broken file", "write")
+def test_broken_lzf_is_an_error_of_one_line(data: bytes, pcd: Path) -> None:
+    pcd.write_bytes(_pcd(1, "binary_compressed", struct.pack("<II", len(data), 12) + data))
+    fails(partial(read_scan, pcd), pcd, "expected a PCD file, found a broken file", "write")
 
 
 # --- other variants ---
@@ -282,12 +286,11 @@ def test_faces_may_come_before_the_vertices(tmp_path: Path, order: str) -> None:
     fails(lambda: read_scan(path), path)
 
 
-def test_packed_points_that_cannot_be_unpacked_are_said_to_be_too_few(tmp_path: Path) -> None:
-    path = tmp_path / "a.pcd"
+def test_packed_points_that_cannot_be_unpacked_are_said_to_be_too_few(pcd: Path) -> None:
     header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10000\nHEIGHT 1\n"
     data = struct.pack("<II", 100, 120_000) + bytes(100)
-    path.write_bytes(f"{header}DATA binary_compressed\n".encode() + data)
-    fails(lambda: read_scan(path), "expected 120000 bytes", "found 100 packed ones")
+    pcd.write_bytes(f"{header}DATA binary_compressed\n".encode() + data)
+    fails(lambda: read_scan(pcd), "expected 120000 bytes", "found 100 packed ones")
 
 
 def test_a_class_that_las_has_no_room_for_is_not_read_as_another_one(tmp_path: Path) -> None:
@@ -373,39 +376,36 @@ def test_a_message_that_claims_more_than_it_has_is_refused(changes: dict[str, An
     fails(lambda: read_message(message, "here"), "here")
 
 
-def test_range_images_are_flattened_row_by_row(tmp_path: Path) -> None:
-    path = tmp_path / "a.npy"
+def test_range_images_are_flattened_row_by_row(npy: Path) -> None:
     image = some_points(24).reshape(4, 6, 4)
     distance = np.linalg.norm(image[:, :, :3], axis=2)
     label = np.arange(24).reshape(4, 6) % 3
 
     for extra in ([], [distance], [distance, label]):
-        np.save(path, np.dstack([image, *extra]).astype(np.float32))
-        cloud = read_cloud(path)
+        np.save(npy, np.dstack([image, *extra]).astype(np.float32))
+        cloud = read_cloud(npy)
         np.testing.assert_array_equal(cloud.to_scan().points, some_points(24))
         assert cloud.ring is None
         assert "4 x 6" in cloud.note
         assert ("left out" in cloud.note) == bool(extra)
 
 
-def test_the_fifth_column_of_a_range_image_can_be_the_ring(tmp_path: Path) -> None:
-    path = tmp_path / "a.npy"
+def test_the_fifth_column_of_a_range_image_can_be_the_ring(npy: Path) -> None:
     image = some_points(24).reshape(8, 3, 4)
     ring = np.arange(24).reshape(8, 3) // 3
-    np.save(path, np.dstack([image, ring]).astype(np.float32))
-    np.testing.assert_array_equal(read_cloud(path).ring, ring.ravel())
+    np.save(npy, np.dstack([image, ring]).astype(np.float32))
+    np.testing.assert_array_equal(read_cloud(npy).ring, ring.ravel())
 
 
-def test_arrays_with_named_columns_and_of_either_order_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.npy"
+def test_arrays_with_named_columns_and_of_either_order_are_read(npy: Path) -> None:
     points = some_points()
     named = np.zeros(60, [("Intensity", "f8"), ("Z", "f4"), ("X", "f4"), ("Y", "f4")])
     for name, values in zip(("X", "Y", "Z", "Intensity"), points.T, strict=True):
         named[name] = values
 
     for array in (named, np.asfortranarray(points), points.astype(">f8")):
-        np.save(path, array)
-        np.testing.assert_allclose(read_scan(path).points, points, rtol=1e-6)
+        np.save(npy, array)
+        np.testing.assert_allclose(read_scan(npy).points, points, rtol=1e-6)
 
 
 def test_an_archive_with_no_clear_array_is_refused(tmp_path: Path) -> None:
@@ -442,13 +442,12 @@ def test_an_mcap_file_without_messages_of_ros_2_is_refused(tmp_path: Path) -> No
         fails(lambda: Bag(path, ".mcap"), "Profile is not ros2")
 
 
-def test_the_offset_that_the_error_for_map_coordinates_names_helps(tmp_path: Path) -> None:
-    path = tmp_path / "a.npy"
+def test_the_offset_that_the_error_for_map_coordinates_names_helps(npy: Path) -> None:
     points = some_points().astype(float)
     points[:, :3] += (500_000, 5_400_000, 100)
-    np.save(path, points)
-    fails(lambda: read_scan(path), "--offset -x,-y,-z")
-    moved = Sensor(offset=(-500_000, -5_400_000, -100)).to_level(read_cloud(path).xyz)
+    np.save(npy, points)
+    fails(lambda: read_scan(npy), "--offset -x,-y,-z")
+    moved = Sensor(offset=(-500_000, -5_400_000, -100)).to_level(read_cloud(npy).xyz)
     np.testing.assert_allclose(moved, some_points()[:, :3], atol=1e-3)
 
 
@@ -475,17 +474,15 @@ def test_intensities_and_rings_in_arrays_of_their_own_are_read(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("shape", [(4, 60), (3, 60), (5, 6, 60)])
-def test_a_transposed_array_is_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    path = tmp_path / "a.npy"
-    np.save(path, np.ones(shape, np.float32))
-    fails(lambda: read_scan(path), path, shape, "transposed", "moveaxis")
+def test_a_transposed_array_is_refused(npy: Path, shape: tuple[int, ...]) -> None:
+    np.save(npy, np.ones(shape, np.float32))
+    fails(lambda: read_scan(npy), npy, shape, "transposed", "moveaxis")
 
 
-def test_columns_of_no_single_number_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.npy"
+def test_columns_of_no_single_number_are_refused(npy: Path) -> None:
     for kind in (("x", "f4", 3), ("x", "U3"), ("x", [("a", "f4")])):
-        np.save(path, np.zeros(60, [kind, ("y", "f4"), ("z", "f4")]))
-        fails(lambda: read_scan(path), path, "'x'")
+        np.save(npy, np.zeros(60, [kind, ("y", "f4"), ("z", "f4")]))
+        fails(lambda: read_scan(npy), npy, "'x'")
 
 
 @pytest.mark.parametrize("ending", ["npy", "csv"])
@@ -522,15 +519,14 @@ def test_a_fifth_column_is_the_ring_only_if_its_values_are(tmp_path: Path, endin
 @pytest.mark.parametrize(
     ("largest", "kind"), [(1, "f4"), (255, "f4"), (65535, "f8"), (255, "u1"), (65535, "u2")]
 )
-def test_intensities_are_scaled_by_their_range(tmp_path: Path, largest: int, kind: str) -> None:
-    path = tmp_path / "a.npy"
+def test_intensities_are_scaled_by_their_range(npy: Path, largest: int, kind: str) -> None:
     points = some_points()
     table = np.zeros(60, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", kind)])
     fill_coordinates(table, points)
     table["intensity"] = np.round(points[:, 3] * largest) if largest > 1 else points[:, 3]
 
-    np.save(path, table)
-    np.testing.assert_allclose(read_scan(path).points[:, 3], points[:, 3], atol=0.002)
+    np.save(npy, table)
+    np.testing.assert_allclose(read_scan(npy).points[:, 3], points[:, 3], atol=0.002)
 
 
 def test_a_dimension_of_las_with_rings_is_read(tmp_path: Path) -> None:
