@@ -248,8 +248,7 @@ def test_sequences_that_are_named_are_scored(world: Path, tmp_path: Path) -> Non
     options = f"--weights {world}/headless.safetensors --sequences 00,01 --json {tmp_path}/m.json"
     succeed(f"evaluate {world}/data {options}")
     figures = read_json(tmp_path / "m.json")
-    assert figures["scans"] == 4
-    assert list(figures["methods"]) == ["rv", "bev", "ensemble"]
+    assert (figures["scans"], list(figures["methods"])) == (4, ["rv", "bev", "ensemble"])
 
 
 @pytest.mark.parametrize(("name", "predictions"), [("semantickitti", "."), ("nuscenes", "results")])

@@ -135,8 +135,7 @@ def test_splits_are_folders_patterns_or_lists_and_may_cut_through_a_folder(tmp_p
             np.save(tmp_path / f"{site}/{index}.npy", some_points())
     data = open_own(describe(tmp_path, split={"train": ["a", "b/[23]"], "val": ["b/0.npy", "b/1"]}))
 
-    assert data.sequences("train") == ("a", "b-train")
-    assert data.sequences("val") == ("b-val",)
+    assert (data.sequences("train"), data.sequences("val")) == (("a", "b-train"), ("b-val",))
     assert [record.name for record in data.records(["b-val"])] == ["b/0", "b/1"]
     assert data.sequences("all") == ("a", "b-train", "b-val", "c")
     assert data.records(["b"]) == data.records(["b-train", "b-val"])

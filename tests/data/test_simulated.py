@@ -111,8 +111,7 @@ def test_the_splits_are_different_streets(sensor: str, tmp_path: Path) -> None:
     fails(lambda: dataset.sequences("test"), "train, val, all", "test")
 
     scans = to_train(dataset)
-    assert len(scans.train) == 6 * len(train)
-    assert len(scans.val) == 36
+    assert (len(scans.train), len(scans.val)) == (6 * len(train), 36)
 
 
 def test_any_number_is_a_street(tmp_path: Path) -> None:

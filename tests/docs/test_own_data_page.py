@@ -78,5 +78,4 @@ def test_scores_are_of_the_users_classes(tmp_path: Path, monkeypatch: pytest.Mon
     figures = tmp_path / "figures.json"
     succeed("evaluate", data, "--predictions", tmp_path / "perfect", "--json", figures)
     report = json.loads(figures.read_text())["methods"]["predictions"]
-    assert list(report["iou"]) == list(CLASSES)
-    assert report["accuracy"] == 1
+    assert (list(report["iou"]), report["accuracy"]) == (list(CLASSES), 1)

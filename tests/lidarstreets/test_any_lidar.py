@@ -83,8 +83,7 @@ def test_rows_by_density_order_the_lasers_without_knowing_them(name: str) -> Non
     points = scan.points[scan.labels > 0]
     ring = scan.ring[scan.labels > 0]
     rows = rows_by_density(points, laser_density(points), 64)
-    assert rows.min() == 0
-    assert rows.max() == 63
+    assert (rows.min(), rows.max()) == (0, 63)
 
     seen = [laser for laser in range(lasers) if np.count_nonzero(ring == laser) > 50]
     middle = np.array([np.median(rows[ring == laser]) for laser in seen])

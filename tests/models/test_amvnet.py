@@ -366,8 +366,7 @@ def test_a_scan_of_many_uncertain_points_is_classified_by_sectors_with_the_same_
         monkeypatch.setattr(point_head_module, "POINTS_AT_ONCE", 64)
         h = model.refine(batch, f, g, uncertain)
 
-    assert max(classified) == 64
-    assert sum(classified) == uncertain.sum()
+    assert (max(classified), sum(classified)) == (64, uncertain.sum())
     torch.testing.assert_close(h, expected)
 
 

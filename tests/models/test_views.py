@@ -128,8 +128,7 @@ def assert_equals_the_loop(scan: Scan, config: RangeViewConfig) -> None:
     view = project_to_image(scan, config)
     pixels, nearest, image = range_view_by_loop(scan.select(scan.valid), config)
 
-    assert view.pixel.tolist() == pixels
-    assert view.nearest.tolist() == nearest
+    assert (view.pixel.tolist(), view.nearest.tolist()) == (pixels, nearest)
     np.testing.assert_allclose(view.image[0].numpy(), image, rtol=1e-6, atol=1e-6)
 
 

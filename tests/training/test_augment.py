@@ -348,8 +348,7 @@ def test_lasers_without_rings_are_bins_of_elevation(random_scan: RandomScan) -> 
     scan = replace(random_scan(5000), ring=None)
     scan.points[3, 0] = math.nan
     bins = lasers(scan)
-    assert bins.min() == 0
-    assert bins.max() == ELEVATION_BINS - 1
+    assert (bins.min(), bins.max()) == (0, ELEVATION_BINS - 1)
 
     valid = scan.valid
     order = np.argsort(elevations(scan)[valid])

@@ -75,8 +75,7 @@ def test_all_scans_of_a_mixed_dataset_take_equally_many_turns(tmp_path: Path) ->
     counts: Counter[str] = Counter()
     for epoch in range(14 // 2):  # the lowest number of epochs that is a multiple for 4 places
         counts.update(record.name for record in data.in_epoch(1, epoch))
-    assert len(counts) == 14
-    assert set(counts.values()) == {2}
+    assert (len(counts), set(counts.values())) == (14, {2})
 
 
 def test_a_mixed_scan_is_read_from_its_own_dataset(tmp_path: Path) -> None:

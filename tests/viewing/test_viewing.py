@@ -177,8 +177,7 @@ def test_points_without_a_place_are_left_out_and_counted(tmp_path: Path) -> None
     xyz, planes = page.scan(0)
 
     np.testing.assert_allclose(xyz, points[[0, 2], :3], atol=1e-4)
-    assert planes["labels"].tolist() == [1, 3]
-    assert planes["intensity"].tolist() == [128, 255]
+    assert (planes["labels"].tolist(), planes["intensity"].tolist()) == ([1, 3], [128, 255])
     assert page.about["scans"][0]["note"].startswith("2 ")
 
 
