@@ -195,7 +195,8 @@ def test_scores_are_probabilities_of_both_networks_as_float16(world: Path, tmp_p
         assert set(arrays.files) == {"rv", "bev"}
         for name, probabilities in (("rv", result.rv), ("bev", result.bev)):
             assert probabilities is not None
-            assert (arrays[name].dtype, arrays[name].shape) == (np.float16, (500, 19))
+            assert arrays[name].dtype == np.float16
+            assert arrays[name].shape == (500, 19)
             assert np.array_equal(arrays[name], probabilities.astype(np.float16))
 
 

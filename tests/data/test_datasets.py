@@ -76,7 +76,8 @@ def test_a_scan_has_points_intensities_and_labels_if_wanted(
     assert scan.points.dtype == np.float32
     assert scan.points[:, 3].tolist() == pytest.approx(layout.intensity)
     assert scan.labels is not None
-    assert (scan.labels.dtype, scan.labels.tolist()) == (np.uint8, layout.truth)
+    assert scan.labels.dtype == np.uint8
+    assert scan.labels.tolist() == layout.truth
     assert scan.ring is None or scan.ring.tolist() == list(range(7))
     assert dataset.read(record, labels=False).labels is None
 
@@ -91,7 +92,8 @@ def test_predictions_round_trip(dataset: Dataset, record: ScanFile, tmp_path: Pa
     assert path.stat().st_size == 7 * (4 if dataset.taxonomy.name == "semantickitti" else 1)
 
     predicted = dataset.read_prediction(record, folder)
-    assert (predicted.dtype, predicted.tolist()) == (np.uint8, ids.tolist())
+    assert predicted.dtype == np.uint8
+    assert predicted.tolist() == ids.tolist()
 
 
 def test_unfit_ids_are_not_written(dataset: Dataset, record: ScanFile, tmp_path: Path) -> None:

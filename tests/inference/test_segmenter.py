@@ -71,14 +71,17 @@ def test_the_networks_get_the_scan_turned_by_the_yaw() -> None:
 
 def test_every_point_gets_a_class_and_its_scores(result: Segmentation) -> None:
     n = len(POINTS)
-    assert (result.labels.shape, result.labels.dtype) == ((n,), np.uint8)
-    assert (result.uncertain.shape, result.uncertain.dtype) == ((n,), bool)
+    assert result.labels.shape == (n,)
+    assert result.labels.dtype == np.uint8
+    assert result.uncertain.shape == (n,)
+    assert result.uncertain.dtype == bool
     assert 1 <= result.labels.min() <= result.labels.max() <= K
 
     for probabilities in both_networks(result):
         assert np.allclose(probabilities.sum(axis=1), 1, atol=1e-5)
     for scores in (result.scores, *both_networks(result)):
-        assert (scores.shape, scores.dtype) == ((n, K), np.float32)
+        assert scores.shape == (n, K)
+        assert scores.dtype == np.float32
         assert (scores >= 0).all()
     assert np.array_equal(result.labels, result.scores.argmax(axis=1) + 1)
 

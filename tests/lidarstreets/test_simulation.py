@@ -95,7 +95,8 @@ def test_values_are_in_range(scans: list[SimulatedScan]) -> None:
     fastest = Drive().speed[1] * 1.2 * max(kind.speed for kind in STREET_KINDS.values())
     moved = fastest * HDL64E.rotation_period / 2
     for scan in scans:
-        assert (scan.points.dtype, scan.labels.dtype) == (np.float32, np.uint32)
+        assert scan.points.dtype == np.float32
+        assert scan.labels.dtype == np.uint32
         assert len(scan.points) == len(scan.labels)
         assert 40_000 < len(scan.points) < 64 * HDL64E.azimuth_steps
         assert np.isfinite(scan.points).all()

@@ -114,7 +114,8 @@ def test_labels_intensity_ring_name_and_lost_returns_stay(random_scan: RandomSca
     assert np.array_equal(changed.points[:, 3], scan.points[:, 3])
     assert changed.labels is scan.labels
     assert changed.ring is scan.ring
-    assert (changed.name, changed.points.dtype) == ("somewhere", np.float32)
+    assert changed.name == "somewhere"
+    assert changed.points.dtype == np.float32
 
 
 def test_points_are_dropped_together_with_their_labels_and_rings(random_scan: RandomScan) -> None:

@@ -114,7 +114,8 @@ def test_the_runner_says_what_torch_says(exported: Exports, name: str, count: in
     assert same.mean() >= 0.9999
     assert (expected.labels == actual.labels).mean() >= 0.9999
     assert np.abs(expected.scores - actual.scores)[same].max() <= 1e-4
-    assert (actual.labels.dtype, actual.scores.dtype) == (np.uint8, np.float32)
+    assert actual.labels.dtype == np.uint8
+    assert actual.scores.dtype == np.float32
     assert not actual.labels[~scan.valid].any()
     assert not actual.scores[~scan.valid].any()
 
