@@ -36,7 +36,7 @@ from amvnet.scan import Scan
 from amvnet.weights.file import save
 from lidarstreets.layouts import write_whole
 
-from fixtures.commands import fails, refused, run_cli
+from fixtures.commands import fails, new_file, refused, run_cli
 from fixtures.datasets import MAKERS, make_nuscenes
 from fixtures.examples import first_of, with_examples
 from fixtures.surroundings import LINKS, NAMES, PRECIOUS, REFUSED, contents_outside, surroundings
@@ -380,8 +380,7 @@ def test_content_is_on_disk_before_a_name(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 
 def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "a.txt"
-    path.write_bytes(PRECIOUS)
+    path = new_file(tmp_path / "a.txt", PRECIOUS)
     with suppress(KeyboardInterrupt), atomic_write(path) as part:
         part.write_text("half")
         raise KeyboardInterrupt
@@ -430,8 +429,7 @@ def test_a_read_only_folder_is_one_line_that_names_the_file(
 
 
 def test_an_output_folder_that_is_a_file_is_called_one(tmp_path: Path) -> None:
-    path = tmp_path / "out"
-    path.write_bytes(PRECIOUS)
+    path = new_file(tmp_path / "out", PRECIOUS)
     fails(lambda: files.make_folder(path), "expected a folder to write to, found a file; give")
     assert path.read_bytes() == PRECIOUS
 

@@ -17,7 +17,7 @@ from amvnet.files import Signature, check_outputs
 from amvnet.inference.journal import JOURNAL, UNFINISHED
 from amvnet.onnx_runner import DESCRIPTION
 
-from fixtures.commands import contents, fails, files, refusal, refused, run_cli, succeed
+from fixtures.commands import contents, fails, files, new_file, refusal, refused, run_cli, succeed
 from fixtures.marks import with_full
 
 MINE = b"hours of work"
@@ -332,8 +332,7 @@ def test_the_labels_of_a_broken_scan_stay_the_users(world: Path, tmp_path: Path)
 
 
 def test_a_run_that_writes_nothing_leaves_no_folder(world: Path, tmp_path: Path) -> None:
-    scan = tmp_path / "a.bin"
-    scan.write_bytes(b"truncated")
+    scan = new_file(tmp_path / "a.bin", b"truncated")
     refusal(f"predict {scan} --weights {world}/w.safetensors --out {tmp_path}/out")
     assert files(tmp_path) == {"a.bin"}
     assert not (tmp_path / "out").exists()

@@ -18,7 +18,7 @@ from amvnet.errors import InputError, SomeBroken
 from amvnet.files import atomic_write, temporary_folder, unfinished
 from amvnet.inference.journal import Entry, Journal
 
-from fixtures.commands import STOPPED, run_cli
+from fixtures.commands import STOPPED, new_file, run_cli
 from fixtures.processes import PATIENCE, running, said_at_the_end
 from fixtures.scan_writers import some_points, write_las
 from fixtures.world import SCANS
@@ -276,8 +276,7 @@ def test_what_follows():
 
 
 def test_a_signal_ends_pytest_also_while_a_command_runs_in_it(tmp_path: Path) -> None:
-    path = tmp_path / "test_long.py"
-    path.write_text(LONG.replace("{started}", str(tmp_path / "started")))
+    path = new_file(tmp_path / "test_long.py", LONG.replace("{started}", str(tmp_path / "started")))
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     words = ("-m", "pytest", "-s", "-p", "no:cacheprovider", path)
     with running(*words, environment=environment) as process:

@@ -18,13 +18,11 @@ from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.config.schema import ModelConfig, PointHeadConfig, Recipe
 
-from fixtures.commands import fails
+from fixtures.commands import fails, new_file
 
 
 def write_recipe(folder: Path, text: str) -> str:
-    path = folder / "mine.yaml"
-    path.write_text(text)
-    return str(path)
+    return str(new_file(folder / "mine.yaml", text))
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -164,8 +162,7 @@ def test_a_users_file_without_a_base_builds_on_the_papers_sizes(tmp_path: Path) 
 
 
 def test_a_users_file_may_build_on_another_users_file(tmp_path: Path) -> None:
-    first = tmp_path / "first.yaml"
-    first.write_text("base: nuscenes\ntraining: {seed: 5, workers: 2}")
+    first = new_file(tmp_path / "first.yaml", "base: nuscenes\ntraining: {seed: 5, workers: 2}")
     second = write_recipe(tmp_path, f"base: {first}\ntraining: {{seed: 6}}")
 
     training = load_recipe(second).training

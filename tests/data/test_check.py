@@ -16,7 +16,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.plausible import following, neighbours
 
-from fixtures.commands import refusal, refused, run_cli, succeed
+from fixtures.commands import new_file, refusal, refused, run_cli, succeed
 from fixtures.datasets import MAKERS
 from fixtures.examples import first_of
 from fixtures.scan_writers import some_points
@@ -44,9 +44,7 @@ def data(tmp_path: Path) -> Path:
 
 
 def describe(folder: Path, **changes: Any) -> Path:
-    path = folder / "own.yaml"
-    path.write_text(yaml.safe_dump({**BASE, **changes}, sort_keys=False))
-    return path
+    return new_file(folder / "own.yaml", yaml.safe_dump({**BASE, **changes}, sort_keys=False))
 
 
 def write_labels(path: Path, raw: np.ndarray) -> None:

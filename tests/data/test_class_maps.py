@@ -17,7 +17,7 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import read_page
-from fixtures.commands import fails, refusal, refused, succeed
+from fixtures.commands import fails, new_file, refusal, refused, succeed
 from fixtures.own_scans import make_own_scans, make_robot_quick
 from fixtures.tiny import GOLDEN, fresh_weights, make_streets
 
@@ -289,15 +289,13 @@ def test_classes_that_are_not_scored_are_said_with_their_share(
 
 
 def test_two_classes_of_one_name_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "few.yaml"
-    path.write_text("classes: {ground: [road], 'ground': [car]}")
+    path = new_file(tmp_path / "few.yaml", "classes: {ground: [road], 'ground': [car]}")
     fails(lambda: class_map(str(path)), path, "the key 'ground' twice")
 
 
 @pytest.mark.parametrize("name", ["no", "on", "1", "1.5", "null"])
 def test_a_name_that_yaml_reads_as_another_value_needs_quotes(tmp_path: Path, name: str) -> None:
-    path = tmp_path / "few.yaml"
-    path.write_text(f"classes: {{{name}: [road]}}")
+    path = new_file(tmp_path / "few.yaml", f"classes: {{{name}: [road]}}")
     fails(lambda: class_map(str(path)), path, "quotes")
     path.write_text(f"classes: {{'{name}': [road]}}")
     assert class_map(str(path)).target.classes == (name,)

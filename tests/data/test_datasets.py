@@ -18,7 +18,7 @@ from amvnet.data.datasets.training_data import to_train
 from amvnet.data.recordings import ScanFile
 from amvnet.data.taxonomy import SEMANTICKITTI
 
-from fixtures.commands import fails
+from fixtures.commands import fails, new_file
 from fixtures.datasets import COUNTS, MAKERS, Layout, make_nuscenes, make_semantickitti
 from fixtures.tiny import make_streets
 
@@ -270,12 +270,10 @@ def test_nuscenes_tables_that_cannot_be_used(tmp_path: Path) -> None:
         categories.write_text(text)
         fails(lambda: open_dataset(layout.spec), categories, "expected a table")
 
-    labels = folder / "lidarseg.json"
-    labels.write_text('[{"sample_data_token": "a"}]')
+    labels = new_file(folder / "lidarseg.json", '[{"sample_data_token": "a"}]')
     fails(lambda: open_dataset(layout.spec), folder, "filename")
     labels.unlink()
-    samples = folder / "sample.json"
-    samples.write_text('[{"token": "a"}]')
+    samples = new_file(folder / "sample.json", '[{"token": "a"}]')
     fails(lambda: open_dataset(layout.spec), folder, "scene_token")
     samples.write_text("[")
     fails(lambda: open_dataset(layout.spec), samples)

@@ -19,7 +19,7 @@ from amvnet.data.formats.find import list_scans, read_cloud
 from amvnet.data.formats.rows import parse_layout
 from amvnet.errors import InputError
 
-from fixtures.commands import fails
+from fixtures.commands import fails, new_file
 from fixtures.scan_writers import WRITERS, some_points, write_sweep
 
 PACKETS = "uint8[] data\n"
@@ -49,8 +49,7 @@ def test_a_bag_of_other_messages_says_how_they_become_clouds(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", ["a.parquet", "a.pkl", "a.pcap"])
 def test_formats_that_are_not_read_are_refused(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    path.write_bytes(bytes(range(256)))
+    path = new_file(tmp_path / name, bytes(range(256)))
     fails(lambda: read_cloud(path), path, "convert it", "PointCloud2")
 
 
@@ -83,8 +82,7 @@ def test_a_broken_sweep_is_one_line(tmp_path: Path) -> None:
 
 
 def test_feather_needs_a_named_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.feather"
-    path.write_bytes(b"ARROW1\0\0")
+    path = new_file(tmp_path / "a.feather", b"ARROW1\0\0")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     fails(lambda: read_cloud(path), path, 'pip install "amvnet[feather]"')
 
@@ -105,8 +103,7 @@ def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 def test_every_format_may_be_packed(tmp_path: Path, contents: dict[str, bytes]) -> None:
     for name, content in contents.items():
-        path = tmp_path / f"{name}.gz"
-        path.write_bytes(gzip.compress(content))
+        path = new_file(tmp_path / f"{name}.gz", gzip.compress(content))
         (scan,) = list_scans(path)
         assert (scan.name, scan.path) == (scan_stem(Path(name)), path)
         assert scan.ending == named_ending(Path(name))
@@ -117,8 +114,7 @@ def test_every_format_may_be_packed(tmp_path: Path, contents: dict[str, bytes]) 
 
 
 def test_rows_may_be_packed(tmp_path: Path) -> None:
-    path = tmp_path / "a.bin.gz"
-    path.write_bytes(gzip.compress(some_points()[:, :3].tobytes()))
+    path = new_file(tmp_path / "a.bin.gz", gzip.compress(some_points()[:, :3].tobytes()))
     cloud = read_cloud(path, parse_layout("z,y,x", None))
     np.testing.assert_array_equal(cloud.xyz, some_points()[:, 2::-1])
 
@@ -136,8 +132,7 @@ def test_a_broken_packed_file_is_one_line(tmp_path: Path, contents: dict[str, by
         "an archive": gzip.compress(contents["archive.npz"][:40]),
     }
     for name, content in cases.items():
-        path = tmp_path / f"{name}.bin.gz"
-        path.write_bytes(content)
+        path = new_file(tmp_path / f"{name}.bin.gz", content)
         fails(lambda path=path: read_cloud(path).to_scan(), path)  # type: ignore[misc]
 
 

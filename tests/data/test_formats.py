@@ -30,7 +30,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 
 from fixtures import scan_writers
-from fixtures.commands import fails, not_none
+from fixtures.commands import fails, new_file, not_none
 from fixtures.scan_writers import WRITERS, pcd_bytes, some_points, write_bag1, write_bag2
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
@@ -78,8 +78,7 @@ def test_every_format_holds_the_same_scan(folder: Path, name: str) -> None:
 def test_the_content_counts_if_the_name_is_wrong(
     folder: Path, tmp_path: Path, name: str, disguise: str
 ) -> None:
-    path = tmp_path / disguise
-    path.write_bytes((folder / name).read_bytes())
+    path = new_file(tmp_path / disguise, (folder / name).read_bytes())
     np.testing.assert_allclose(read_scan(path).points, some_points(), rtol=0, atol=LAS_STEP)
 
 
@@ -329,8 +328,7 @@ def test_times_before_the_coordinates_are_not_called_a_map(tmp_path: Path, name:
     ],
 )
 def test_files_of_other_kinds_are_named(tmp_path: Path, name: str, data: bytes, kind: str) -> None:
-    path = tmp_path / name
-    path.write_bytes(data)
+    path = new_file(tmp_path / name, data)
     fails(lambda: read_scan(path), path, f"found {kind};")
 
 
@@ -567,8 +565,7 @@ def test_a_bag_is_its_scans_in_order(
 
 @pytest.mark.parametrize("name", ["a#b", "a?b", "a%41b", "a b"])
 def test_bags_of_any_name_are_read(folder: Path, tmp_path: Path, name: str) -> None:
-    lone = tmp_path / f"{name}.db3"
-    lone.write_bytes((folder / "lone.db3").read_bytes())
+    lone = new_file(tmp_path / f"{name}.db3", (folder / "lone.db3").read_bytes())
     np.testing.assert_array_equal(read_scan(lone).points, some_points())
 
     # rosbags writes no such names.
@@ -690,8 +687,7 @@ def test_claimed_billions_are_refused_before_memory_is_taken(folder: Path, tmp_p
         "b.laz": _las(folder / "packed.laz", "<I", 107, MAX_POINTS),
     }
     for name, content in contents.items():
-        path = tmp_path / name
-        path.write_bytes(content)
+        path = new_file(tmp_path / name, content)
 
         tracemalloc.start()
         fails(partial(read_scan, path), path)

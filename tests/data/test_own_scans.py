@@ -18,7 +18,7 @@ from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 
-from fixtures.commands import fails, run_cli
+from fixtures.commands import fails, new_file, run_cli
 from fixtures.scan_writers import some_points, write_las, write_ply
 
 RAW = np.random.default_rng(1).choice([3, 7, 40], 60)
@@ -243,15 +243,13 @@ def test_the_rest_of_the_ids_can_be_ignored(site: Path, ignored: Any) -> None:
 
 
 def test_ids_before_names_are_told_to_come_after_them(site: Path) -> None:
-    path = site.parent / "own.yaml"
-    path.write_text("classes: {0: ground, 1: plant}\nscans: '*/*.npy'\n")
+    path = new_file(site.parent / "own.yaml", "classes: {0: ground, 1: plant}\nscans: '*/*.npy'\n")
     fails(lambda: open_own(path), path, "found 0: 'ground'", "write the name first")
 
 
 @pytest.mark.parametrize("text", ["{no: 1, b: 2}", "{1: 1, b: 2}", "{a: 1, b: 2, 'a': 3}"])
 def test_names_that_yaml_changes_or_drops_are_refused(site: Path, text: str) -> None:
-    path = site.parent / "own.yaml"
-    path.write_text(f"classes: {text}\nscans: '*/*.npy'\n")
+    path = new_file(site.parent / "own.yaml", f"classes: {text}\nscans: '*/*.npy'\n")
     fails(lambda: open_own(path), path, "twice" if "'a'" in text else "quotes")
 
 
@@ -393,8 +391,7 @@ def test_a_file_of_another_encoding_is_told_to_be_utf_8(site: Path, encoding: st
     ],
 )
 def test_broken_yaml_is_one_line_with_the_mistake(tmp_path: Path, text: str, mistake: str) -> None:
-    path = tmp_path / "own.yaml"
-    path.write_text(text)
+    path = new_file(tmp_path / "own.yaml", text)
     with pytest.raises(InputError) as caught:
         open_own(path)
     line = str(caught.value).removeprefix(str(path))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.poses import read_poses, times_of
 
-from fixtures.commands import fails, not_none
+from fixtures.commands import fails, new_file, not_none
 from fixtures.drives import TO_CAMERA, drive_poses, write_drive
 from fixtures.tiny import GOLDEN
 
@@ -230,16 +230,14 @@ def test_no_poses_are_one_line(tmp_path: Path) -> None:
 
 
 def test_equal_times_are_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "tum.txt"
-    path.write_text("1 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
+    path = new_file(tmp_path / "tum.txt", "1 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
     fails(lambda: read_poses(path), "ascending times", "1 s twice", "pose 1", "remove one")
     path.write_text("1 0 0 0 0 0 0 1\n0 1 0 0 0 0 0 1\n")
     fails(lambda: read_poses(path), "0 s late", "sort them")
 
 
 def test_angles_in_place_of_quaternions_are_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "tum.txt"
-    path.write_text("0 1 2 3 0 0 90 0\n1 1 2 3 0 0 91 0\n")
+    path = new_file(tmp_path / "tum.txt", "0 1 2 3 0 0 90 0\n1 1 2 3 0 0 91 0\n")
     fails(lambda: read_poses(path), "quaternions", "0 0 90 0")
 
 
@@ -248,8 +246,7 @@ def test_angles_in_place_of_quaternions_are_one_line(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("name", ["poses.txt", "poses.npy"])
 def test_another_file_is_one_line(tmp_path: Path, name: str, content: bytes) -> None:
-    path = tmp_path / name
-    path.write_bytes(content)
+    path = new_file(tmp_path / name, content)
     fails(lambda: read_poses(path), name, "expected")
 
 

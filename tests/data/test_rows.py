@@ -15,7 +15,7 @@ from amvnet.data.formats.find import find_scans, list_scans, read_cloud
 from amvnet.data.formats.rows import NAMES, RowLayout, are_rings, name_columns, parse_layout
 from amvnet.data.formats.text import find_table
 
-from fixtures.commands import fails, not_none
+from fixtures.commands import fails, new_file, not_none
 from fixtures.growth import takes_linear_time
 from fixtures.sensors import LASERS, place
 
@@ -34,9 +34,7 @@ def row_bytes(table: np.ndarray, dtype: str = "float32") -> bytes:
 
 
 def write_rows(folder: Path, table: np.ndarray, dtype: str = "float32") -> Path:
-    path = folder / "a.bin"
-    path.write_bytes(row_bytes(table, dtype))
-    return path
+    return new_file(folder / "a.bin", row_bytes(table, dtype))
 
 
 @pytest.mark.parametrize("order", ["as recorded", "shuffled"])
@@ -76,8 +74,7 @@ def test_other_columns_are_asked_for(table: np.ndarray, tmp_path: Path, order: s
     if order == "shuffled":
         table = np.random.default_rng(0).permutation(table)
     for name, content in rows_of_other_layouts(table).items():
-        path = tmp_path / f"{name}.bin"
-        path.write_bytes(content)
+        path = new_file(tmp_path / f"{name}.bin", content)
         fails(lambda path=path: read_cloud(path), path, "--columns", "--dtype")  # type: ignore[misc]
 
 
@@ -112,8 +109,7 @@ def test_a_truncated_file_keeps_columns(table: np.ndarray, tmp_path: Path, colum
 
 
 def test_values_that_fit_nothing_are_refused_and_both_options_named(tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
-    path.write_bytes(np.random.default_rng(0).bytes(60_000))
+    path = new_file(tmp_path / "a.bin", np.random.default_rng(0).bytes(60_000))
     fails(lambda: read_cloud(path), path, "--columns x,y,z,intensity,ring", "--dtype float32")
 
 
@@ -252,8 +248,7 @@ def test_text_is_read_with_any_header(table: np.ndarray, tmp_path: Path, header:
 def test_text_is_read_with_any_separator_and_name(
     table: np.ndarray, tmp_path: Path, name: str, separator: str
 ) -> None:
-    path = tmp_path / name
-    path.write_text(text_of(table[:400], separator).replace("\n", "\r\n"))
+    path = new_file(tmp_path / name, text_of(table[:400], separator).replace("\n", "\r\n"))
     check_text(path, table[:400])
 
 
@@ -266,8 +261,7 @@ def test_text_is_read_with_any_ends_of_lines(table: np.ndarray, tmp_path: Path, 
 
 
 def test_columns_of_text_can_have_any_order_and_words_among_them(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("label,z,y,x\ncar,3,2,1\nroad,6,5,4\n")
+    path = new_file(tmp_path / "a.csv", "label,z,y,x\ncar,3,2,1\nroad,6,5,4\n")
     assert read_cloud(path).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
@@ -275,16 +269,14 @@ def test_text_of_other_things_is_refused(tmp_path: Path) -> None:
     texts = ["hello\n", "1 2\n3 4\n", "x,y,z\n", "P0: 1 2 3\n", "1 2 3\n4 5\n"]
     texts.append("a line of a log\n" * 30 + "1 2 3\n")
     for text in texts:
-        path = tmp_path / "a.txt"
-        path.write_text(text)
+        path = new_file(tmp_path / "a.txt", text)
         fails(lambda path=path: read_cloud(path), path)  # type: ignore[misc]
         assert find_table(text.encode()) is None
 
 
 @pytest.mark.parametrize("separator", [";", " ", "\t"])
 def test_decimal_commas_are_named(separator: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text(f"1,5{separator}-2,0{separator}0,25\n" * 5)
+    path = new_file(tmp_path / "a.csv", f"1,5{separator}-2,0{separator}0,25\n" * 5)
     for scan in (path, tmp_path):
         fails(lambda scan=scan: read_cloud(scan), path, "found decimal commas")  # type: ignore[misc]
 
@@ -361,8 +353,7 @@ def test_patterns_of_any_folders_follow_links_once(table: np.ndarray, tmp_path: 
     expected = [drives / "a/0.bin", drives / "b/deep/0.bin"]
     assert find_scans(drives / "**/*.bin") == expected
     assert find_scans(drives / "*/**/0.bin")
-    path = drives / "own.yaml"
-    path.write_text('classes: {a: 1}\nscans: "**/*.bin"\n')
+    path = new_file(drives / "own.yaml", 'classes: {a: 1}\nscans: "**/*.bin"\n')
     data = open_dataset(str(path))
     assert [record.path for record in data.records(data.sequences("all"))] == expected
 

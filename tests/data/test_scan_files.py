@@ -14,7 +14,7 @@ from amvnet.config.yaml_files import read_yaml
 from amvnet.data.formats.find import find_scans
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 
-from fixtures.commands import fails
+from fixtures.commands import fails, new_file
 
 # --- single files ---
 
@@ -56,15 +56,13 @@ def test_unusable_arrays_are_named(tmp_path: Path, array: np.ndarray) -> None:
     ],
 )
 def test_unusable_files_are_named(tmp_path: Path, name: str, content: bytes) -> None:
-    path = tmp_path / name
-    path.write_bytes(content)
+    path = new_file(tmp_path / name, content)
     fails(lambda: read_scan(path), path)
     assert find_scans(path) == [path]
 
 
 def test_an_unknown_format_is_refused_with_the_known_ones(tmp_path: Path) -> None:
-    path = tmp_path / "a.scan"
-    path.write_bytes(b"1 2")
+    path = new_file(tmp_path / "a.scan", b"1 2")
     fails(lambda: read_scan(path), ".pcd.bin", ".bin", ".npy")
 
 
@@ -100,14 +98,12 @@ def test_taxonomy_survives_json_and_pickle(taxonomy: Taxonomy) -> None:
 
 @pytest.mark.parametrize("text", ["a: 1\nb: 2\na: 3\n", "b: {c: 1, 'c': 2}\n", "- {1: a, 1: b}\n"])
 def test_a_key_twice_in_yaml_is_refused(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_text(text)
+    path = new_file(tmp_path / "a.yaml", text)
     fails(lambda: read_yaml(path, "values"), path, "twice")
 
 
 def test_aliases_in_yaml_are_refused_and_anchors_are_not(tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_text("a: &a [1, 2]\n")
+    path = new_file(tmp_path / "a.yaml", "a: &a [1, 2]\n")
     assert read_yaml(path, "a list") == {"a": [1, 2]}
     for text in ("a: &a [1]\nb: *a\n", "a: &a {k: 1}\nb: {<<: *a}\n", "&a [*a]"):
         path.write_text(text)

@@ -17,7 +17,7 @@ from amvnet.data.datasets.starter import write_starter
 from amvnet.data.labels.writers import write_scan_labels
 from amvnet.data.taxonomy import SEMANTICKITTI
 
-from fixtures.commands import files, refusal, refused, succeed
+from fixtures.commands import files, new_file, refusal, refused, succeed
 from fixtures.own_scans import SCANS, SITES, make_own_scans, own_labels, robot_scans
 from fixtures.scan_writers import write_pcd
 
@@ -237,6 +237,5 @@ def test_labels_that_are_not_found_are_shown_with_their_path(
 
 
 def test_names_is_answered_with_classes(tmp_path: Path) -> None:
-    path = tmp_path / "own.yaml"
-    path.write_text("names: {car: 1}\nscans: '*.npy'\n")
+    path = new_file(tmp_path / "own.yaml", "names: {car: 1}\nscans: '*.npy'\n")
     refused(f"check {path}", "did you mean classes?")

@@ -28,7 +28,7 @@ from amvnet.sensors.reading import Reading
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import read_page
-from fixtures.commands import fails, refused, run_cli, succeed
+from fixtures.commands import fails, new_file, refused, run_cli, succeed
 from fixtures.drives import SCANS, drive_poses, write_drive
 from fixtures.tiny import fresh_weights
 
@@ -178,8 +178,7 @@ def test_the_viewer_and_the_readers_take_a_map(world: Path, tmp_path: Path) -> N
 
 @pytest.mark.full
 def test_a_map_replaces_maps_only(world: Path, tmp_path: Path) -> None:
-    out = tmp_path / "map.ply"
-    out.write_text("ply\nmy own points")
+    out = new_file(tmp_path / "map.ply", "ply\nmy own points")
     refused(command(world, out), "--overwrite")
     refused(command(world, out, "--overwrite"), "a map")
     assert out.read_text() == "ply\nmy own points"

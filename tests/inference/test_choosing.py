@@ -19,7 +19,7 @@ from amvnet.sensors.lasers import SensorGeometry
 from amvnet.sensors.lidars import BUILT_IN, KNOWN_SENSORS, make_sensor
 from amvnet.sensors.reading import Reading
 
-from fixtures.commands import fails, files, refused, succeed
+from fixtures.commands import fails, files, new_file, refused, succeed
 from fixtures.datasets import make_nuscenes, make_semantickitti
 from fixtures.sensors import LASERS, place
 
@@ -95,8 +95,7 @@ def test_the_classes_of_a_dataset_choose(tmp_path: Path) -> None:
 
 def test_the_yaml_file_of_own_scans_describes_the_sensor_that_chooses(tmp_path: Path) -> None:
     write(tmp_path / "scan.npy", "vlp16")
-    path = tmp_path / "own.yaml"
-    path.write_text("scans: '*.npy'\nclasses: {car: 1}\nsensor: hdl32e\n")
+    path = new_file(tmp_path / "own.yaml", "scans: '*.npy'\nclasses: {car: 1}\nsensor: hdl32e\n")
     assert find_inputs([str(path)]).choose_weights()[0] == "sim-hdl32e"
     path.write_text("scans: '*.npy'\nclasses: {car: 1}\nsensor: {name: hdl32e, height: 1}\n")
     assert find_inputs([str(path)]).choose_weights()[0] == "sim-hdl32e"

@@ -30,7 +30,7 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import save
 
 from fixtures.bag_poses import drive_clouds, drive_odometry, odometry, pose_at, write_bag
-from fixtures.commands import contents, fails, files, not_none, refused, run_cli, succeed
+from fixtures.commands import contents, fails, files, new_file, not_none, refused, run_cli, succeed
 from fixtures.drives import HEIGHT, SCANS, drive_poses, drive_scans, write_drive
 from fixtures.tiny import fresh_weights
 
@@ -291,7 +291,7 @@ def test_poses_that_were_turned_by_a_calibration_say_so(world: Path, tmp_path: P
     find_poses(scans, of_lidar, report=lines.append)
     assert lines[-1].endswith("by the file, as the LiDAR's, without calib.txt beside it")
 
-    kitti = shutil.copy(world / "data/sequences/00/poses.txt", tmp_path / "00.txt")
+    kitti = Path(shutil.copy(world / "data/sequences/00/poses.txt", tmp_path / "00.txt"))
     fails(lambda: find_poses(scans, kitti), "00.txt", "without calib.txt", "apart")
     shutil.copy(world / "data/sequences/00/calib.txt", tmp_path)
     find_poses(scans, kitti, report=lines.append)
@@ -410,8 +410,7 @@ def test_evaluate_fuses_scans_in_other_axes_as_predict_does(world: Path, tmp_pat
         "poses: ../poses.txt",
         "sensor: {axes: y-forward}",
     ]
-    data = tmp_path / "own.yaml"
-    data.write_text("\n".join(lines))
+    data = new_file(tmp_path / "own.yaml", "\n".join(lines))
 
     succeed(predict(world, tmp_path / "out", data=data))
     figures = {}

@@ -21,7 +21,7 @@ from lidarstreets import LIDAR_MODELS, SimulatedScan, SimulationError, simulate
 from lidarstreets.sensing.any_sensor import LASERS, MAX_SHOTS, draw_sensor
 from lidarstreets.sensing.sensors import LidarModel, draw_device
 
-from fixtures.commands import fails, not_none
+from fixtures.commands import fails, new_file, not_none
 from fixtures.tiny import make_simulation_quick
 
 pytest.importorskip("embreex")
@@ -142,8 +142,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_sensor_of_a_yaml_file_is_simulated(tmp_path: Path, quick: None) -> None:
-    path = tmp_path / "robot.yaml"
-    path.write_text("beams: 20\nfov_up: 10\nfov_down: -28\nheight: 0.6\n")
+    path = new_file(tmp_path / "robot.yaml", "beams: 20\nfov_up: 10\nfov_down: -28\nheight: 0.6\n")
     lidar = simulated_lidar(make_sensor(str(path)))
     np.testing.assert_allclose(lidar.elevations, np.linspace(10, -28, 20))
     assert (lidar.name, lidar.height) == ("robot", 0.6)

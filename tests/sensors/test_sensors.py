@@ -35,7 +35,7 @@ from amvnet.sensors.rows import _row_view
 from amvnet.weights.file import built_in, load, save
 from lidarstreets import LIDAR_MODELS
 
-from fixtures.commands import fails, files, not_none, refusal, run_cli
+from fixtures.commands import fails, files, new_file, not_none, refusal, run_cli
 from fixtures.datasets import make_nuscenes
 from fixtures.examples import first_of, with_examples
 from fixtures.scan_writers import pcd_bytes, write_bag1
@@ -486,8 +486,7 @@ def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_description_is_named(tmp_path: Path, text: str, words: list[str]) -> None:
-    path = tmp_path / "robot.yaml"
-    path.write_text(text)
+    path = new_file(tmp_path / "robot.yaml", text)
     fails(lambda: make_sensor(str(path)), path, *words)
 
 
@@ -534,8 +533,7 @@ def test_labels_are_at_the_lines_of_their_points(world: Path, tmp_path: Path, we
     names = ("x", "y", "z", "intensity")
     table = points.view([(name, "f4") for name in names]).ravel()
     content = pcd_bytes(table, [(name, "F 4", 1) for name in names], height=16)
-    path = tmp_path / "a.pcd"
-    path.write_bytes(content)
+    path = new_file(tmp_path / "a.pcd", content)
 
     options = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path)
     assert run_cli("predict", path, *options)[0] == 0
@@ -671,8 +669,7 @@ def test_a_name_in_a_description_is_that_of_a_known_sensor(tmp_path: Path) -> No
     assert make_sensor({"name": "pandar64", "height": 2}) == replace(known, height=2)
     fails(lambda: make_sensor({"name": "pandar6444"}), "did you mean pandar64?")
 
-    path = tmp_path / "robot.yaml"
-    path.write_text("name: pandar64\nfov_up: 12\n")
+    path = new_file(tmp_path / "robot.yaml", "name: pandar64\nfov_up: 12\n")
     assert make_sensor(str(path)) == replace(known, fov_up=12)
     path.write_text("name: pandar6444\n")
     fails(lambda: make_sensor(str(path)), path, "did you mean pandar64?")

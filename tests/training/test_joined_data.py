@@ -36,7 +36,7 @@ from amvnet.training.plan import Plan, open_for_training, sized_by_init, without
 from amvnet.weights.file import Weights, load, save
 
 from fixtures import tiny
-from fixtures.commands import fails, not_none, refusal, refused, run_cli, succeed
+from fixtures.commands import fails, new_file, not_none, refusal, refused, run_cli, succeed
 from fixtures.own_scans import make_own_scans
 from fixtures.tiny import fake_drive, fresh_weights, make_streets, write_recipe
 
@@ -171,9 +171,7 @@ def own_file(tmp_path: Path) -> Path:
     streets = make_streets(tmp_path / "own", ("00",), 2)
     classes = {name: number for number, name in enumerate(SEMANTICKITTI.classes, start=1)}
     description = {"classes": classes, "scans": f"{streets.name}/sequences/00/velodyne/*.bin"}
-    path = tmp_path / "own.yaml"
-    path.write_text(yaml.safe_dump(description, sort_keys=False))
-    return path
+    return new_file(tmp_path / "own.yaml", yaml.safe_dump(description, sort_keys=False))
 
 
 def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_file: Path) -> None:

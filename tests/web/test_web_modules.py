@@ -45,6 +45,7 @@ from amvnet.sensors.normalise import Normaliser
 from amvnet.weights import verdict
 from amvnet.weights.file import load
 
+from fixtures.commands import new_file
 from fixtures.marks import with_quick
 from fixtures.processes import PATIENCE
 from fixtures.scan_writers import WRITERS, pcd_bytes, some_points
@@ -101,8 +102,7 @@ def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
             "expected": {"view": to_dict(case.expected.view), **case.expected.to_dict()},
         }
         jobs.append(job)
-    listing = folder / "jobs.json"
-    listing.write_text(json.dumps(jobs))
+    listing = new_file(folder / "jobs.json", json.dumps(jobs))
     command = [str(NODE), str(DRIVER), str(PAGE), str(listing)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
@@ -390,9 +390,7 @@ def with_y_up_in_millimetres(folder: Path) -> Case:
     x, y, z, intensity = points.T
     table = np.column_stack([-1000 * y, 1000 * z, -1000 * x, intensity]).astype(np.float64)
     fields = [(name, "F 8", 1) for name in ("x", "y", "z", "intensity")]
-    path = folder / "cameras.pcd"
-    path.write_bytes(pcd_bytes(table, fields))
-    return Case(path)
+    return Case(new_file(folder / "cameras.pcd", pcd_bytes(table, fields)))
 
 
 def at_the_foot_of_a_vehicle(folder: Path) -> Case:
@@ -779,8 +777,7 @@ def test_integers_of_any_size_are_read(lasers: int, tmp_path: Path) -> None:
     table["Intensity"] = points[:, 3] * 40_000
     table["ring"] = laser % lasers
     fields = [(name, f"{kind[0].upper()} {kind[1]}", 1) for name, kind in kinds.items()]
-    path = tmp_path / "mixed.pcd"
-    path.write_bytes(pcd_bytes(table, fields))
+    path = new_file(tmp_path / "mixed.pcd", pcd_bytes(table, fields))
 
     case = Case(path, "sim-hdl32e")
     (page,) = run_page([case], tmp_path)

@@ -32,6 +32,7 @@ from amvnet.weights.file import load, save
 from amvnet.weights.verdict import Verdict
 
 from fixtures.browser_pages import CHROMIUM, FLAGS
+from fixtures.commands import new_file
 from fixtures.pages import load_script
 from fixtures.scan_writers import write_pcd
 from fixtures.sensors import LASERS, place
@@ -159,8 +160,7 @@ def scan_files(folder: Path) -> dict[str, Path]:
     """Write a scan as of KITTI, one as of nuScenes, one of PCL, a small one and a broken file."""
     points, _ = place(np.linspace(-23.9, 3, 64), 2.2, steps=500)
     points[::40, :3] = 0  # lost returns
-    kitti = folder / "kitti.bin"
-    kitti.write_bytes(points.astype(np.float32).tobytes())
+    kitti = new_file(folder / "kitti.bin", points.astype(np.float32).tobytes())
 
     points, laser = place(LASERS["hdl32e"], 1.84, steps=1000)
     nuscenes = folder / "nuscenes.pcd.bin"
@@ -170,10 +170,8 @@ def scan_files(folder: Path) -> dict[str, Path]:
     points, _ = place(LASERS["os1-64"], 1.9, steps=500)
     pcd = write_pcd(folder / "cloud.pcd", points, "binary_compressed")
     points, _ = place(np.linspace(-23.9, 3, 16), 1.73, steps=250)
-    own = folder / f"{HOSTILE}.bin"
-    own.write_bytes(points.astype(np.float32).tobytes())
-    broken = folder / f"{HOSTILE}.pcd"
-    broken.write_bytes(pcd.read_bytes()[:-500])
+    own = new_file(folder / f"{HOSTILE}.bin", points.astype(np.float32).tobytes())
+    broken = new_file(folder / f"{HOSTILE}.pcd", pcd.read_bytes()[:-500])
     return {"kitti": kitti, "nuscenes": nuscenes, "pcd": pcd, "own": own, "broken": broken}
 
 

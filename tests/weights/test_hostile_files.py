@@ -24,7 +24,7 @@ from amvnet.config.yaml_files import read_yaml
 from amvnet.weights.card import model_card
 from amvnet.weights.file import FORMAT, Weights, load
 
-from fixtures.commands import fails, run_cli, succeed
+from fixtures.commands import fails, new_file, run_cli, succeed
 from fixtures.memory import memory_below
 from fixtures.tiny import fresh_weights
 
@@ -279,8 +279,7 @@ def test_hostile_weights_are_refused(
 
 @pytest.mark.parametrize("text", YAML_TEXTS.values(), ids=YAML_TEXTS)
 def test_hostile_yaml_is_refused(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text(text)
+    path = new_file(tmp_path / "mine.yaml", text)
     with memory_below(MEMORY):
         fails(lambda: read_yaml(path, "a recipe"), "mine.yaml")
 
@@ -291,8 +290,7 @@ def test_hostile_yaml_is_refused(text: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("share", [0.01, 0.5, 0.999])
 def test_truncated_weights_are_called_truncated(share: float, good: Path, tmp_path: Path) -> None:
     content = good.read_bytes()
-    path = tmp_path / "w.safetensors"
-    path.write_bytes(content[: int(share * len(content))])
+    path = new_file(tmp_path / "w.safetensors", content[: int(share * len(content))])
     fails(lambda: load(path), path, "truncated", "copy it again")
 
 
