@@ -211,7 +211,8 @@ def test_a_scan_is_never_replaced_by_its_labels(tmp_path: Path, segmenter: Segme
 def test_labels_replace_earlier_labels_alone(result: Segmentation, tmp_path: Path) -> None:
     for kind in KINDS:
         path = result.save(tmp_path / f"a.{kind}")
-        assert result.save(path).read_bytes() == path.read_bytes()
+        before = path.read_bytes()
+        assert result.save(path).read_bytes() == before
         path.write_bytes(b"PK something else")
         fails(partial(result.save, path), path, "found another file")
         assert path.read_bytes() == b"PK something else"

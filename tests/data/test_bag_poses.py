@@ -165,9 +165,8 @@ def in_circle() -> list[Sent]:
 
 
 def of_another_epoch() -> list[Sent]:
-    return [
-        odometry(one.time + 1.7e9, bag_poses.pose_at(one.time)) for one in drive_odometry(SCANS)
-    ]
+    sent = drive_odometry(SCANS)
+    return [odometry(one.time + 1.7e9, bag_poses.pose_at(one.time)) for one in sent]
 
 
 def of_two_frames() -> list[Sent]:

@@ -368,9 +368,8 @@ def test_messages_with_gaps_and_either_byte_order_are_read(padded: bool, big: bo
     [{"width": 61}, {"width": 2**32 - 1, "row_step": 0}, {"row_step": 10}, {"fields": []}],
 )
 def test_a_message_that_claims_more_than_it_has_is_refused(changes: dict[str, Any]) -> None:
-    message = scan_writers.cloud_message(
-        get_typestore(Stores.ROS2_HUMBLE), some_points(), **changes
-    )
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    message = scan_writers.cloud_message(store, some_points(), **changes)
     fails(lambda: read_message(message, "here"), "here")
 
 

@@ -298,7 +298,7 @@ def score_options(world: Path) -> list[Any]:
 def head(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train the head alone, on the networks' scores from files."""
     out = tmp_path_factory.mktemp("trained") / "head"
-    assert run_cli(*[*train_head_arguments(world, out), *score_options(world)]) == (0, "")
+    assert run_cli(*train_head_arguments(world, out), *score_options(world)) == (0, "")
     return out
 
 
@@ -306,7 +306,7 @@ def head(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_head_for_files_is_that_of_networks(world: Path, head: Path, tmp_path: Path) -> None:
     # Without the world's head, which would be trained further
     networks = save(without(fresh_weights(), "point_head"), tmp_path / "networks.safetensors")
-    assert run_cli(*[*train_head_arguments(world, tmp_path / "run"), "--init", networks]) == (0, "")
+    assert run_cli(*train_head_arguments(world, tmp_path / "run"), "--init", networks) == (0, "")
 
     from_networks = load(tmp_path / "run")
     from_files = load(head)

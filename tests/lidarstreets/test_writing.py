@@ -94,7 +94,7 @@ def run_on_two_processes(out: Path) -> subprocess.Popen[bytes]:
     """Start a long simulation, as the leader of a group of processes; return once it writes."""
     command = [sys.executable, "-m", "lidarstreets", str(out)]
     parent = subprocess.Popen(
-        [*command, *["--sequences", "2", "--scans", str(SCANS), "--processes", "2"]],
+        [*command, "--sequences", "2", "--scans", str(SCANS), "--processes", "2"],
         stderr=subprocess.PIPE,
         start_new_session=True,
         # Tests that a shell started in the background ignore SIGINT.

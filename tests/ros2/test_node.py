@@ -370,9 +370,8 @@ def warnings_of(node: Any) -> list[str]:
 def test_scans_are_fused_with_past_scans_as_by_predict_on_a_bag(
     start: Start, weights: Path, tmp_path: Path, drive: Drive
 ) -> None:
-    bag = write_bag(
-        tmp_path / "bag", [*drive_odometry(DRIVE_SCANS), *bag_poses.drive_clouds(DRIVE_SCANS)]
-    )
+    sent = [*drive_odometry(DRIVE_SCANS), *bag_poses.drive_clouds(DRIVE_SCANS)]
+    bag = write_bag(tmp_path / "bag", sent)
     options = "--drive --past-only --poses /odom --format npy"
     for name, value in SENSOR.items():
         options += f" --{name.replace('_', '-')} {value}"
