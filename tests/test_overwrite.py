@@ -95,9 +95,7 @@ def test_a_users_file_stays_and_nothing_is_written(
     name: str, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     case = CASES[name]
-    mine = tmp_path / case.file
-    mine.parent.mkdir(parents=True, exist_ok=True)
-    mine.write_bytes(MINE)
+    mine = new_file(tmp_path / case.file, MINE)
 
     refused(case.text(world, tmp_path), case.file, "--overwrite")
 
@@ -111,9 +109,7 @@ def test_a_users_file_stays_and_nothing_is_written(
 @pytest.mark.parametrize("name", with_full(CASES, SLOW + ALIKE))
 def test_files_of_one_kind_are_replaced_if_told(name: str, world: Path, tmp_path: Path) -> None:
     case = CASES[name]
-    earlier = tmp_path / case.file
-    earlier.parent.mkdir(parents=True, exist_ok=True)
-    earlier.write_bytes(case.earlier)
+    earlier = new_file(tmp_path / case.file, case.earlier)
     succeed(case.text(world, tmp_path) + " --overwrite")
     assert earlier.read_bytes() != case.earlier
 
@@ -249,9 +245,7 @@ def test_an_ablations_table_is_replaced_only_among_its_runs(world: Path, tmp_pat
     [("hdl64e", "sequences/01/velodyne/000000.bin"), ("hdl32e", "v1.0-trainval/scene.json")],
 )
 def test_simulated_scans_do_not_replace_real_ones(sensor: str, name: str, tmp_path: Path) -> None:
-    mine = tmp_path / name
-    mine.parent.mkdir(parents=True)
-    mine.write_bytes(MINE)
+    new_file(tmp_path / name, MINE)
     line = refusal(f"simulate {tmp_path} --sensor {sensor} --sequences 2 --scans 1")
     assert "found something else" in line
     assert contents(tmp_path) == {name: MINE}

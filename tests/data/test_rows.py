@@ -307,9 +307,7 @@ def test_poses_next_to_a_folder_of_scans_are_no_scan(tmp_path: Path) -> None:
 
 def test_patterns_name_scans(tmp_path: Path) -> None:
     for name in ("a/1.bin", "a/2.bin", "a/1.label", "b/1.bin", "b/.2.bin"):
-        path = tmp_path / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(np.ones((2, 4), np.float32).tobytes())
+        new_file(tmp_path / name, np.ones((2, 4), np.float32).tobytes())
 
     def names(pattern: str) -> list[str]:
         return [scan.name for scan in list_scans(tmp_path / pattern)]
@@ -326,9 +324,8 @@ def test_patterns_name_scans(tmp_path: Path) -> None:
 def test_a_pattern_takes_the_scans_of_many_drives(tmp_path: Path) -> None:
     for drive in ("0001", "0005"):
         data = tmp_path / f"2011_09_26_drive_{drive}_sync/velodyne_points/data"
-        data.mkdir(parents=True)
-        (data.parent / "timestamps.txt").write_text("2011-09-26 13:02:25.594360375\n")
-        (data / "0000000000.bin").write_bytes(np.ones((2, 4), np.float32).tobytes())
+        new_file(data.parent / "timestamps.txt", "2011-09-26 13:02:25.594360375\n")
+        new_file(data / "0000000000.bin", np.ones((2, 4), np.float32).tobytes())
 
     (data.parent / "classes").mkdir()
     np.save(data.parent / "classes/0000000000.npy", np.ones(2, np.uint8))  # labels are no scans
@@ -342,8 +339,7 @@ def test_patterns_of_any_folders_follow_links_once(table: np.ndarray, tmp_path: 
     drives = tmp_path / "drives"
     elsewhere = tmp_path / "disk"
     for folder in (drives / "a", elsewhere / "deep"):
-        folder.mkdir(parents=True)
-        (folder / "0.bin").write_bytes(row_bytes(table[:, :4]))
+        new_file(folder / "0.bin", row_bytes(table[:, :4]))
     (drives / "b").symlink_to(elsewhere)
     for name in ("up", "again"):  # many ways around in circles
         (drives / "a" / name).symlink_to(drives)

@@ -26,7 +26,7 @@ from amvnet.sensors.lidars import KNOWN_SENSORS
 from amvnet.training.loaders import ScanSet, make_loader
 from lidarstreets import SimulatedScan, drive_street, simulate, writing
 
-from fixtures.commands import fails, not_none
+from fixtures.commands import fails, new_file, not_none
 from fixtures.tiny import fake_drive
 
 BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES, "vlp32c": SEMANTICKITTI}
@@ -206,9 +206,7 @@ def test_streets_read_long_ago_make_room(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_only_streets_are_ever_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = tmp_path / "sequences/00/velodyne/000000.bin"
-    kept.parent.mkdir(parents=True)
-    kept.write_bytes(bytes(1000))
+    kept = new_file(tmp_path / "sequences/00/velodyne/000000.bin", bytes(1000))
     monkeypatch.setattr(simulated, "CACHE_BYTES", 1)
     dataset = SimulatedStreets(tmp_path)
     for record in dataset.records(["1", "2"]):

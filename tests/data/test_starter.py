@@ -84,8 +84,7 @@ def test_labels_in_a_folder_beside_the_scans_are_found(tmp_path: Path) -> None:
     for below in ("", "a/"):
         data = make_flat(tmp_path / f"{below}x", 3, f"scans/{below}{{:04d}}.pcd")
         make_flat(data, 3, "points/{:04d}.npy", f"labels/{below}{{:04d}}.npy")
-        (data / "photos").mkdir()
-        (data / "photos/0000.jpg").write_bytes(b"photo")
+        new_file(data / "photos/0000.jpg", b"photo")
         path, found = write_starter(data / "scans")
         assert found.labelled == 3
         started = open_own(path)
@@ -148,8 +147,7 @@ def test_scans_without_labels_get_a_file_that_says_so(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_scans_gets_no_file(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data/scan.pcd").write_text("no scan")
+    new_file(tmp_path / "data/scan.pcd", "no scan")
     refused(f"check {tmp_path / 'data'}", "found none that can be read")
     assert not (tmp_path / "data.yaml").exists()
 

@@ -20,7 +20,7 @@ from amvnet.data.datasets.open import open_dataset
 from lidarstreets import LIDAR_MODELS, SimulatedScan, SimulationError, simulate, writing
 from lidarstreets.sensing.sensors import LidarModel
 
-from fixtures.commands import contents
+from fixtures.commands import contents, new_file
 from fixtures.tiny import fake_drive, make_simulation_quick
 from fixtures.waiting import wait_for_end
 
@@ -285,9 +285,7 @@ def test_the_files_that_the_tables_name_are_there(nuscenes: Path) -> None:
 
 @pytest.mark.parametrize("name", ["robot.yaml", "site_a/truth/0000.npy"])
 def test_a_robot_does_not_replace_files_that_were_not_simulated(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("mine")
+    path = new_file(tmp_path / name, "mine")
     with pytest.raises(SimulationError, match="another folder"):
         simulate(tmp_path, sensor="vlp16", scans=1)
     assert path.read_text() == "mine"

@@ -20,7 +20,7 @@ from amvnet.training import adapt as adapting
 from amvnet.training.adapt import LEAST_PROBABILITY, Figures, recipe_for, teach
 from amvnet.weights.file import load, save
 
-from fixtures.commands import not_none, refused, run_cli, succeed
+from fixtures.commands import new_file, not_none, refused, run_cli, succeed
 from fixtures.drives import drive_poses, drive_scans, write_drive
 from fixtures.tiny import fresh_weights
 
@@ -168,9 +168,7 @@ def test_labels_that_are_all_unsure_teach_nothing(world: Path, tmp_path: Path) -
 
 
 def test_a_folder_of_something_else_stays_as_it_was(world: Path, tmp_path: Path) -> None:
-    labels = tmp_path / "teacher/00/000000.npy"
-    labels.parent.mkdir(parents=True)
-    labels.write_text("mine")
+    labels = new_file(tmp_path / "teacher/00/000000.npy", "mine")
     refused(command(world, tmp_path), "another run or teacher")
     assert labels.read_text() == "mine"
     assert len(list(tmp_path.rglob("*"))) == 3

@@ -16,7 +16,7 @@ import amvnet
 from amvnet.weights.card import model_card
 from amvnet.weights.file import load, save
 
-from fixtures.commands import fails, run_cli
+from fixtures.commands import fails, new_file, run_cli
 from fixtures.tiny import fresh_weights, street, without
 
 NAME = "hf-hub:somebody/streets"
@@ -72,9 +72,7 @@ def test_pushed_weights_can_be_loaded(hub: Hub) -> None:
 
 @pytest.mark.parametrize("file", ["model.safetensors", "README.md"])
 def test_what_the_hub_has_is_replaced_only_if_the_user_says_so(hub: Hub, file: str) -> None:
-    mine = hub.root / "somebody/streets" / file
-    mine.parent.mkdir(parents=True)
-    mine.write_bytes(b"hours of work")
+    mine = new_file(hub.root / "somebody/streets" / file, b"hours of work")
     fails(lambda: amvnet.push(WEIGHTS, NAME), "somebody/streets", file, "overwrite=True")
     assert list(mine.parent.iterdir()) == [mine]
     assert mine.read_bytes() == b"hours of work"
@@ -168,9 +166,7 @@ def test_a_name_that_cannot_be_loaded_is_one_line(hub: Hub) -> None:
     fails(lambda: load("hf-hub:nobody/nothing"), "nobody/nothing", "404", "model.safetensors")
     fails(lambda: load("hf-hub:nothing"), "OWNER/NAME")
 
-    folder = hub.root / "somebody/pickles"
-    folder.mkdir(parents=True)
-    (folder / "model.safetensors").write_bytes(b"\x80\x04\x95")
+    new_file(hub.root / "somebody/pickles/model.safetensors", b"\x80\x04\x95")
     fails(lambda: load("hf-hub:somebody/pickles"), "safetensors")
 
 

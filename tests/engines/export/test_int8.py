@@ -24,7 +24,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.weights.file import Weights, save
 
-from fixtures.commands import fails, files, succeed
+from fixtures.commands import fails, files, new_file, succeed
 from fixtures.exports import check_versions, shallow_weights
 from fixtures.sensors import rings_of
 from fixtures.tiny import fresh_weights, street, trained_for, with_intensities, without
@@ -232,9 +232,7 @@ def test_calibrating_without_scans_is_one_line(weights: Weights, tmp_path: Path)
 def test_calibrating_with_a_bad_scan_is_one_line(
     weights: Weights, tmp_path: Path, content: bytes
 ) -> None:
-    scan = tmp_path / "scans/a.bin"
-    scan.parent.mkdir()
-    scan.write_bytes(content)
+    scan = new_file(tmp_path / "scans/a.bin", content)
     check_refused(weights, str(scan.parent), tmp_path, "expected")
 
 
