@@ -50,7 +50,8 @@ from amvnet.config.schema import (
 from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import STAGES, run_once
-from amvnet.models.amvnet import Disagreement, build_amvnet, cosine_similarity
+from amvnet.models.amvnet import build_amvnet
+from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights, part_state, save
 from lidarstreets import simulate

@@ -25,7 +25,7 @@ import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.segmentation import Segmentation
-from amvnet.models.amvnet import disputed_points
+from amvnet.models.assertion import disputed_points
 from amvnet.models.point_head import first_in_cubes
 
 Choice = tuple[float, float]  # a lead and a cell

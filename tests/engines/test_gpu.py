@@ -28,7 +28,8 @@ from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.scan_stream import READ_AHEAD
 from amvnet.models import neighbours_gpu as block_search
-from amvnet.models.amvnet import Disagreement, LateFusion
+from amvnet.models.amvnet import LateFusion
+from amvnet.models.assertion import Disagreement
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
 from amvnet.models.views.points import PointBatch

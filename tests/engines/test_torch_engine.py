@@ -19,7 +19,7 @@ from amvnet.engines.torch import TorchEngine
 from amvnet.inference.segmentation import expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models import layers
-from amvnet.models.amvnet import disputed_points
+from amvnet.models.assertion import disputed_points
 from amvnet.models.layers import ConvBlock
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet

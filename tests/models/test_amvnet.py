@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.schema import PointHeadConfig
 from amvnet.models import neighbours
 from amvnet.models import point_head as point_head_module
-from amvnet.models.amvnet import Disagreement, disputed_points
+from amvnet.models.assertion import Disagreement, disputed_points
 from amvnet.models.layers import freeze
 from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
 from amvnet.models.neighbours import Query

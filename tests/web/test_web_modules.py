@@ -30,7 +30,7 @@ from amvnet.data.formats.rows import UNKNOWN
 from amvnet.data.recordings import Recording, ScanFile
 from amvnet.errors import InputError
 from amvnet.inference import segmentation
-from amvnet.models import amvnet as whole
+from amvnet.models import assertion
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.views import polar_view
 from amvnet.onnx_runner import distances, image_rows, polar_features, range_image, scores_of_points
@@ -698,7 +698,7 @@ def test_points_share_a_cube_as_in_the_onnx_runner(edge: float, tmp_path: Path) 
 
 # Where the package has the numbers of a module, by the same names.
 PLACES: dict[str, tuple[object, ...]] = {
-    "method/fusion.js": (whole,),
+    "method/fusion.js": (assertion,),
     "method/head.js": (onnx_runner,),
     "method/networks.js": (onnx_runner,),
     "method/polar_view.js": (polar_view,),

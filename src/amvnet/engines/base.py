@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.engines.compute import Precision
-from amvnet.models.amvnet import AMVNet, Disagreement, Score, Scores
+from amvnet.models.amvnet import AMVNet, Score, Scores
+from amvnet.models.assertion import Disagreement
 from amvnet.models.layers import freeze
 from amvnet.models.methods import METHODS, MethodName, check_method
 from amvnet.models.polar_net import PolarNet

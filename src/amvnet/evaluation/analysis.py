@@ -17,7 +17,8 @@ from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.evaluation.scoring import stream_labelled
 from amvnet.inference.segmentation import expand_labels, expand_to_scan, scores_by_method
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.amvnet import Disagreement, cosine_similarity, disputed_points, replace_rows
+from amvnet.models.amvnet import replace_rows
+from amvnet.models.assertion import Disagreement, cosine_similarity, disputed_points
 from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan

@@ -19,7 +19,8 @@ from amvnet.inference.listing import Inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults, check_output
 from amvnet.inference.scores import LEAST_PROBABILITY, ScorePair, as_probabilities, have_opinion
 from amvnet.inference.segmentation import Segmentation, fetch, unpack
-from amvnet.models.amvnet import Disagreement, LateFusion, Scores
+from amvnet.models.amvnet import LateFusion, Scores
+from amvnet.models.assertion import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress

@@ -19,7 +19,7 @@ from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.inference.listing import Inputs
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.amvnet import Disagreement
+from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method
 from amvnet.progress import Reporter, report_nothing
 from amvnet.scan import AnyArray, Scan

@@ -15,7 +15,7 @@ from amvnet.engines.compute import EngineName, Precision
 from amvnet.files import digest, size_and_time
 from amvnet.inference.drive import Drives
 from amvnet.inference.pipeline import LABELS, LabelFiles, OutputOptions
-from amvnet.models.amvnet import Disagreement
+from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import MethodName, check_method, check_two_networks
 from amvnet.sensors.reading import AS_FOUND, Reading
 from amvnet.weights.file import Weights

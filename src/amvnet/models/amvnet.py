@@ -1,7 +1,4 @@
-"""AMVNet: two networks segment a scan in two projections; a point head refines uncertain points.
-
-The assertion finds these points by comparing the two networks' scores (section 3.2).
-"""
+"""AMVNet: two networks segment a scan in two projections; a point head refines uncertain points."""
 
 from __future__ import annotations
 
@@ -10,11 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import ModelConfig
-from amvnet.errors import InputError
+from amvnet.models.assertion import Assertion, Disagreement, disputed_points
 from amvnet.models.methods import Ensemble, geometric_mean
 from amvnet.models.point_head import PointHead, first_in_cubes, nearest_neighbours
 from amvnet.models.polar_net import PolarNet
@@ -28,11 +24,6 @@ Watch = Callable[[str], AbstractContextManager[Any]]
 Score = Callable[[], Tensor]  # runs one network; returns (P, K)
 # Runs the networks of the range view and of the bird's-eye view, and returns f and g.
 Arrangement = Callable[[Score, Score], tuple[Tensor, Tensor]]
-# Takes the class probabilities f and g (P, K) of the two networks, and the points (P, 4): x, y, z
-# in metres and intensity in [0, 1]. Returns u (P,) bool, True if a point is uncertain.
-Assertion = Callable[[Tensor, Tensor, Tensor], Tensor]
-
-TINY = 1e-12  # smallest divisor, which keeps the cosine of all-zero scores finite
 
 
 def one_after_the_other(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
@@ -55,55 +46,6 @@ class Scores:
     uncertain: Tensor
     rv: Tensor | None
     bev: Tensor | None
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """The paper's assertion: a point is uncertain if the cosine similarity is at most tau.
-
-    Attributes:
-        tau: largest cosine similarity of f and g at an uncertain point, 0 to 1.
-
-    Raises:
-        InputError: if tau is out of range.
-    """
-
-    tau: float = 0.85
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.tau <= 1:  # this also refuses NaN
-            raise InputError(f"expected tau from 0 to 1, found {self.tau}; give another")
-
-    def __call__(self, f: Tensor, g: Tensor, points: Tensor) -> Tensor:
-        return cosine_similarity(f, g) <= self.tau
-
-
-def disputed_points(f: Tensor, g: Tensor, uncertain: Tensor, lead: float) -> Tensor:
-    """Return (P,) bool: the points that the head classifies, among the `uncertain` ones (P,).
-
-    At a disputed point, the networks name different classes by f and g (P, K), or the best class
-    by their geometric mean is at most `lead` times as probable as the second. Elsewhere the head
-    hardly ever changes a label, but takes as much time. With a lead of 0, all uncertain points are
-    disputed, as in the paper.
-    """
-    if not lead:
-        return uncertain
-
-    index = uncertain.nonzero()[:, 0]
-    f, g = f.index_select(0, index), g.index_select(0, index)
-    differs = f.argmax(dim=1) != g.argmax(dim=1)
-    squares = f * g  # of the mean's probabilities
-    is_close = squares * lead**2 >= squares.amax(dim=1, keepdim=True)
-    disputed = uncertain.clone()
-    disputed[index] = differs | (is_close.sum(dim=1) > 1)
-    return disputed
-
-
-def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
-    """Return the cosine similarity (P,) of class probabilities f and g (P, K), at most 1."""
-    lengths = f.norm(dim=1) * g.norm(dim=1)
-    similarity: Tensor = torch.linalg.vecdot(f, g) / lengths.clamp_min(TINY)
-    return similarity.clamp_max(1)  # rounding must not put a point beyond tau = 1
 
 
 class LateFusion(nn.Module):

@@ -312,8 +312,9 @@ def order_rings(scan: Scan) -> tuple[Scan, str]:
 
     means, is_steady = _elevations_of_rings(xyz[is_used], used)
     if not is_steady:
-        fault = "rings that do not follow the elevations (not used)"
-        return dataclasses.replace(scan, ring=None), fault
+        return dataclasses.replace(
+            scan, ring=None
+        ), "rings that do not follow the elevations (not used)"
 
     ascending = means[occurring[count[occurring] >= MIN_RING_POINTS]]
     if not _falls(ascending):

@@ -21,7 +21,7 @@ from amvnet.data.recordings import ScanFile
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
 from amvnet.inference.scores import LEAST_PROBABILITY
-from amvnet.models.amvnet import Assertion, Disagreement
+from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
 from amvnet.models.views.points import PointBatch

@@ -24,7 +24,8 @@ from amvnet.inference.segmentation import (
     scores_by_method,
 )
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.amvnet import Scores, cosine_similarity
+from amvnet.models.amvnet import Scores
+from amvnet.models.assertion import cosine_similarity
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan
 
