@@ -48,7 +48,9 @@ def test_the_same_things_are_the_same_class_in_both_benchmarks(built_in: str) ->
 
 
 @pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES])
-def test_both_benchmarks_have_lidogs_seven_classes_and_no_two_wheelers(taxonomy: Taxonomy) -> None:
+def test_both_benchmarks_have_the_seven_classes_of_lidog_and_no_two_wheelers(
+    taxonomy: Taxonomy,
+) -> None:
     table = class_map("lidog").table(taxonomy)
     assert set(table.tolist()) == set(range(8))
     for name, train_id in zip(taxonomy.classes, table[1:], strict=True):
@@ -140,7 +142,9 @@ def test_labels_of_other_classes_than_those_that_are_shown_are_refused(
     np.testing.assert_array_equal(planes["truth"], truth == 3)
 
 
-def test_labels_of_weights_and_the_truth_are_shown_with_classes_of_a_map(tmp_path: Path) -> None:
+def test_the_labels_of_weights_and_the_truth_are_shown_with_the_classes_of_a_map(
+    tmp_path: Path,
+) -> None:
     weights = save(fresh_weights(), tmp_path / "w.safetensors")
     data = make_streets(tmp_path / "data")
     pages = []
@@ -229,7 +233,9 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
     assert iou["building"] == pytest.approx(matrix[2] / (matrix[2] + matrix[3]))
 
 
-def test_labels_written_with_a_map_are_scored_with_the_same_map_alone(tmp_path: Path) -> None:
+def test_labels_that_predict_wrote_with_a_map_are_scored_with_the_same_map_alone(
+    tmp_path: Path,
+) -> None:
     data = make_streets(tmp_path / "data")
     weights = save(fresh_weights(), tmp_path / "w.safetensors")
     swap = {"building": {"from": ["road", "car"], "id": 40}, "road": {"from": ["building"]}}

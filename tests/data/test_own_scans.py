@@ -390,7 +390,9 @@ def test_a_file_of_another_encoding_is_told_to_be_utf_8(site: Path, encoding: st
         ("scans: a\nclasses: [1, 2\n", "(expected ',' or ']', but got the end)"),
     ],
 )
-def test_broken_yaml_is_one_line_with_the_mistake(tmp_path: Path, text: str, mistake: str) -> None:
+def test_a_broken_yaml_file_is_one_short_line_with_the_place_of_the_mistake(
+    tmp_path: Path, text: str, mistake: str
+) -> None:
     path = new_file(tmp_path / "own.yaml", text)
     with pytest.raises(InputError) as caught:
         open_own(path)

@@ -395,7 +395,9 @@ class Launches(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_a_gpu_gets_few_orders_around_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_is_told_few_times_what_to_do_around_the_networks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     model = whole_model().eval()
     points = np.random.default_rng(0).normal(0, (20, 20, 1, 0.1), (100_000, 4)).astype(np.float32)
     batch = PointBatch.of([Scan(points)])
@@ -524,7 +526,9 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
     assert files(tmp_path) == names
 
 
-def test_batches_go_through_the_networks_together_and_few_are_in_memory(tmp_path: Path) -> None:
+def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory(
+    tmp_path: Path,
+) -> None:
     weights = fresh_weights()
     engine = ScriptedEngine(weights, sure_of(weights.taxonomy.size))
     counter = Counter()
@@ -590,7 +594,9 @@ def test_a_gpu_gives_the_labels_of_a_cpu(simulated_scan: Scan, precision: str) -
 
 @pytest.mark.gpu
 @no_gpu
-def test_graphs_on_a_gpu_are_captured_and_give_scores_without_them(simulated_scan: Scan) -> None:
+def test_graphs_on_a_gpu_are_captured_and_give_the_scores_without_them(
+    simulated_scan: Scan,
+) -> None:
     """A warning says that the check has turned the graphs off: here it is an error."""
     other = Scan(simulated_scan.points[::2])
     expected_segmenter = amvnet.load("sim-hdl64e", "cuda", graphs=False)

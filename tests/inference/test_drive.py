@@ -267,7 +267,9 @@ LESS_EXACT = {
 
 
 @pytest.mark.parametrize("kind", LESS_EXACT)
-def test_less_exact_poses_do_not_pass_in_silence(world: Path, tmp_path: Path, kind: str) -> None:
+def test_poses_that_are_less_exact_than_the_scans_do_not_pass_in_silence(
+    world: Path, tmp_path: Path, kind: str
+) -> None:
     scans, _ = find_inputs([f"{world}/data"]).scans()
     lines: list[str] = []
     np.save(tmp_path / "poses.npy", POSES)

@@ -176,7 +176,9 @@ def test_many_doubtful_recordings_are_few_lines() -> None:
     assert lines[-1] == f"warning: {ADVICE}"
 
 
-def test_predict_judges_each_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recordings_of_a_run_are_judged_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The scans of one folder are those of the training, the others stand on their side."""
     weights = weights_for()
     points = {"level": street(0)[0], "side": street(0)[0][:, [1, 2, 0, 3]]}
@@ -218,7 +220,9 @@ def test_a_dead_link_is_a_broken_scan(tmp_path: Path) -> None:
     refused(f"predict {scans}/b.bin --weights {path} --out {tmp_path}/out", "leads nowhere")
 
 
-def test_files_are_read_and_detected_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_file_is_read_once_and_its_format_detected_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     counts: Counter[str] = Counter()
 
     def count(function: Any, name: str) -> Any:

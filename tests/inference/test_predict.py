@@ -368,7 +368,9 @@ def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) 
     check_same(tmp_path / "out", whole)
 
 
-def test_a_run_is_not_resumed_with_a_namesake_from_elsewhere(world: Path, tmp_path: Path) -> None:
+def test_a_run_is_not_resumed_with_a_scan_of_the_same_name_from_elsewhere(
+    world: Path, tmp_path: Path
+) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         shutil.copy(world / f"scans/00000{'ab'.index(folder)}.bin", tmp_path / folder / "x.bin")

@@ -39,7 +39,9 @@ def command(world: Path, out: Path, options: str = "") -> str:
     return f"train {world}/recipe.yaml --data {world}/data --out {out} {options}"
 
 
-def test_only_whole_checkpoints_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkpoint_is_replaced_only_by_a_whole_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "last.ckpt"
     WholeCheckpoints().save_checkpoint({"epoch": 0}, path)
     write_bytes = Path.write_bytes

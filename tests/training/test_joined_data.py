@@ -198,7 +198,9 @@ def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_f
         assert torch.equal(view.rows(batch), view.rows(as_is))
 
 
-def test_own_scans_are_brought_to_the_initial_weights_first(tmp_path: Path, own_file: Path) -> None:
+def test_ones_own_scans_are_brought_to_the_initial_weights_rather_than_to_earlier_ones(
+    tmp_path: Path, own_file: Path
+) -> None:
     by_height = {
         height: replace(fresh_weights(), expects=Expectation(sensor=Sensor(height=height)))
         for height in (1.0, 2.0)

@@ -273,7 +273,9 @@ def test_an_interrupted_run_resumes_to_the_same_weights(
 
 
 @pytest.mark.full
-def test_averaged_weights_are_validated_and_resumed(world: Path, run: Path, tmp_path: Path) -> None:
+def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
     options = ("--stage", "rv", "--training.rv.ema", 0.8)
     whole = train(world, tmp_path / "whole", *options)
     last = tmp_path / "whole/rv/last.safetensors"
@@ -310,7 +312,9 @@ def test_some_initial_weights_are_kept_and_resumed(world: Path, run: Path, tmp_p
 
 
 @pytest.mark.parametrize("option", ["initial", "distill"])
-def test_a_missing_initial_part_is_missed_at_once(world: Path, tmp_path: Path, option: str) -> None:
+def test_a_part_that_the_initial_weights_lack_is_missed_before_the_first_stage(
+    world: Path, tmp_path: Path, option: str
+) -> None:
     save(without(fresh_weights(), "polar_net"), tmp_path / "rv.safetensors")
     command = (*train_arguments(world, tmp_path / "run"), f"--training.bev.{option}", 0.5)
     error = refusal(*command, "--init", tmp_path / "rv.safetensors")

@@ -141,7 +141,9 @@ def test_what_is_changed_in_the_cache_is_exported_again(
     }
 
 
-def test_a_file_or_link_in_place_of_a_folder_is_replaced(exports: Exports, tmp_path: Path) -> None:
+def test_a_file_or_a_link_in_the_place_of_a_folder_is_replaced(
+    exports: Exports, tmp_path: Path
+) -> None:
     folder = filled()
     folder.rename(tmp_path / "elsewhere")
     (tmp_path / "elsewhere/range_net.onnx").write_bytes(b"changed")
@@ -194,7 +196,9 @@ def test_a_folder_in_which_only_owners_can_rename_may_hold_the_cache(
     assert cached()[1] == ""
 
 
-def test_only_the_users_group_may_write(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_group_of_this_user_alone_may_write(
+    exports: Exports, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Some systems make a group for each user, and let it write."""
     filled().chmod(0o770)
     import grp
@@ -211,7 +215,9 @@ def test_only_the_users_group_may_write(exports: Exports, monkeypatch: pytest.Mo
         assert ("no other user" in cached()[1]) != is_used
 
 
-def test_anothers_cache_is_not_used(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_of_another_user_is_not_used(
+    exports: Exports, monkeypatch: pytest.MonkeyPatch
+) -> None:
     filled()
     monkeypatch.setattr(os, "getuid", lambda: 12_345_678)
     monkeypatch.setattr(cache, "_is_own", lambda status: False)
@@ -285,7 +291,9 @@ def test_concurrent_exports_into_one_cache_all_succeed_and_leave_one_whole(
     assert len(list((user_cache() / "onnx").iterdir())) == 1
 
 
-def test_a_failed_export_leaves_nothing(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_export_that_fails_leaves_nothing(
+    exports: Exports, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(weights: Weights, out: Path, scans: Sequence[Scan]) -> None:
         (out / "range_net.onnx").write_bytes(b"half")
         raise KeyboardInterrupt
@@ -309,7 +317,9 @@ def test_the_cache_lies_where_it_is_said(tmp_path: Path, monkeypatch: pytest.Mon
     assert user_cache() == tmp_path / ".cache" / "amvnet"
 
 
-def test_one_network_has_one_graph(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_of_one_network_have_one_graph(
+    exports: Exports, monkeypatch: pytest.MonkeyPatch
+) -> None:
     weights = replace(
         WEIGHTS, tensors={k: v for k, v in WEIGHTS.tensors.items() if k.startswith("range_net.")}
     )

@@ -446,7 +446,9 @@ def test_without_the_extra_the_command_is_said(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_runner_names_a_missing_runtime(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_runner_without_its_runtime_says_the_command(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     fails(lambda: OnnxSegmenter(folder), "pip install onnxruntime")
 
@@ -475,7 +477,9 @@ def test_the_page_runs(exported: Exports, tmp_path: Path, monkeypatch: pytest.Mo
     assert len(scope["result"].labels) == POINTS
 
 
-def test_a_graph_that_gives_nan_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_graph_that_computes_nan_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(onnx_export, "_convert", lambda *arguments: None)
     monkeypatch.setattr(onnx_export, "_run", lambda *arguments: ([], [], torch.ones(2, 3)))
     monkeypatch.setattr(onnx_export, "_difference", lambda *arguments: math.nan)
