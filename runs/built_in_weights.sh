@@ -4,10 +4,10 @@
 #     runs/built_in_weights.sh hdl64e|hdl32e|any OUT [INIT] [--KEY VALUE ...]
 #
 # INIT are weights to begin with, such as sim-hdl64e; options of `amvnet train` may follow. An epoch has
-# 6,000 scans of 1,000 streets, and each epoch has other streets. With "any", it has as many scans again,
-# each of another sensor that is drawn, so that the networks stay good at an HDL-64E. A network takes 0.5 to 1 s for a scan on
-# a CPU core, and 4 minutes for an epoch on an H100. docs/log.md says how the training of the shipped
-# weights differed. Weights of an earlier recipe take a value that needs no training by runs/set_values.py:
+# 6,000 scans of 1,000 streets, and each epoch has other streets. With "any", each scan is of another
+# sensor that is drawn. A network takes 0.3 to 1 s for a scan on a CPU core, and 4 minutes for an epoch
+# on an H100. docs/log.md says how the training of the shipped weights differed. Weights of an earlier
+# recipe take a value that needs no training by runs/set_values.py:
 # python runs/set_values.py OUT/head/weights.safetensors assertion.lead 2.5
 set -euo pipefail
 sensor=$1 out=$2
@@ -21,7 +21,7 @@ fi
 case $sensor in
     hdl64e) recipe=simulated-compact && streets=(hdl64e) ;;
     hdl32e) recipe=simulated-hdl32e-compact && streets=(hdl32e) ;;
-    any) recipe=simulated-any-compact && streets=(hdl64e any) ;;
+    any) recipe=simulated-any-compact && streets=(any) ;;
     *) echo "expected hdl64e, hdl32e or any, found $sensor" >&2 && exit 2 ;;
 esac
 train=(amvnet train $recipe --resume)
