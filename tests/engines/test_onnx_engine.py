@@ -124,12 +124,13 @@ def test_onnx_takes_the_fastest_provider_that_is_installed_and_int8_the_cpu(
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("name", ["sim-hdl64e", "sim-any"])
 def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     pytest.importorskip("embreex")
     monkeypatch.setattr(int8, "MAX_SCANS", 3)
-    weights = load("sim-hdl64e")
+    weights = load(name)
     scan = int8.simulated_scans(weights)[0]
 
     expected = amvnet.load(weights)(scan).labels

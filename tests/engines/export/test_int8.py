@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -137,6 +137,19 @@ def test_convolutions_hold_integers_nearest_to_their_weights(exported: Folders, 
         steps = kernel.scale.reshape(-1, 1, 1, 1)
         assert (np.abs(kernel.weights * steps - weights) <= 0.5001 * steps + 1e-7).all()
     assert in_float32 == (["stem.0.weight"] if name == "range_net" else [])
+
+
+@pytest.mark.parametrize("sensor", ["any", "vlp16"])
+def test_scans_of_every_sensor_can_be_simulated_as_its_training_has_them(
+    monkeypatch: pytest.MonkeyPatch, sensor: str
+) -> None:
+    pytest.importorskip("embreex")
+    monkeypatch.setattr(int8_export, "MAX_SCANS", 1)
+    weights = replace(trained_for(fresh_weights(), "any"), sensor=sensor)
+    (scan,) = int8_export.simulated_scans(weights)
+    around = np.linalg.norm(scan.points[:, :2], axis=1) < 10
+    ground = np.quantile(scan.points[around & scan.valid, 2], 0.2)
+    assert ground == pytest.approx(-1.73, abs=0.3)
 
 
 @pytest.mark.full
