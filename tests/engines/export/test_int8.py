@@ -139,7 +139,7 @@ def test_convolutions_hold_integers_nearest_to_their_weights(exported: Folders, 
     assert in_float32 == (["stem.0.weight"] if name == "range_net" else [])
 
 
-@pytest.mark.parametrize("sensor", ["any", "vlp16"])
+@pytest.mark.parametrize("sensor", ["any", "vlp16", "hdl64e"])
 def test_scans_of_every_sensor_can_be_simulated_as_its_training_has_them(
     monkeypatch: pytest.MonkeyPatch, sensor: str
 ) -> None:

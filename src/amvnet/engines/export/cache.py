@@ -17,7 +17,7 @@ from tempfile import TemporaryFile
 
 import torch
 
-from amvnet.engines.export.int8 import SIMULATED, simulated_scans
+from amvnet.engines.export.int8 import STREETS, simulated_scans
 from amvnet.engines.export.onnx import OPSET, check_libraries, export
 from amvnet.engines.export.onnx_files import IR_VERSION
 from amvnet.engines.onnx import RANGE_NET, UNET, ExportedNetworks
@@ -82,7 +82,7 @@ def _key(weights: Weights, int8: bool) -> str:
     digests = [weights.digest(part) for part in weights.parts]
     key = [*digests, repr(weights.model), version("amvnet"), torch.__version__]
     if int8:
-        key.append(f"int8 {SIMULATED}")
+        key.append(f"int8 {STREETS}")
     return digest(repr((key, OPSET, IR_VERSION)))
 
 

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.datasets.base import choose_records
-from amvnet.data.datasets.open import open_dataset
 from amvnet.engines.export.onnx_files import digest, finish, quiet
 from amvnet.errors import InputError
 from amvnet.files import temporary_folder
@@ -22,9 +20,7 @@ from amvnet.sensors.normalise import Normaliser, normalised
 from amvnet.weights.file import Weights
 
 SIMULATED = "simulated"  # stands for simulated streets, as the weights' sensor sees them
-SEED = 20_261_121  # the seed of these streets, far from the seeds of any training
-# The same for sensors whose scans are normalised in a training, which has no such streets.
-STREETS = [str(number) for number in range(999_000, 999_004)]
+STREETS = [str(number) for number in range(999_000, 999_004)]  # no training has such streets
 MAX_SCANS = 20  # largest number of scans that calibrate and check
 CHECK_EVERY = 5  # the first of every five scans is for the check, the others to calibrate
 # The least share of labels that must stay; a good calibration keeps far more.
@@ -41,24 +37,18 @@ def simulated_scans(weights: Weights) -> list[Scan]:
     Raises:
         InputError: if the sensor cannot be simulated.
     """
-    from amvnet.data.datasets.simulated import UNCHANGED, SimulatedStreets, simulate
+    from amvnet.data.datasets.simulated import SimulatedStreets
     from amvnet.data.taxonomy import CLASSES_BY_SENSOR
 
     sensor = weights.sensor
     if sensor not in CLASSES_BY_SENSOR:
         raise InputError(
-            f"expected weights of {' or '.join(CLASSES_BY_SENSOR)} to simulate for, "
-            f"found {sensor!r}; give scans of this sensor to amvnet export --int8"
+            f"expected weights of a LiDAR that can be simulated (amvnet list), found {sensor!r}; "
+            "give scans of this sensor to amvnet export --int8"
         )
     with temporary_folder() as folder:
-        if sensor in UNCHANGED:
-            simulate(folder, sensor=sensor, sequences=MAX_SCANS, scans=1, seed=SEED)
-            dataset = open_dataset(str(folder), weights.taxonomy)
-            records = choose_records(dataset, None, "all")
-        else:
-            streets = SimulatedStreets(folder, sensor)
-            dataset = normalised(streets, Normaliser(weights.expects))
-            records = dataset.records(STREETS)[:MAX_SCANS]
+        dataset = normalised(SimulatedStreets(folder, sensor), Normaliser(weights.expects))
+        records = dataset.records(STREETS)[:MAX_SCANS]
         return [weights.expects.prepare(dataset.read(record, labels=False)) for record in records]
 
 
