@@ -625,16 +625,32 @@ def test_scans_of_a_benchmark_are_normalised_for_weights_that_do_not_know_its_se
     np.testing.assert_array_equal(scan.labels, np.where(scan.valid, not_none(unchanged.labels), 0))
     assert (scan.row is not None) == is_changed
     if is_changed:
-        cloud = Cloud(
-            unchanged.points[:, :3], unchanged.points[:, 3], unchanged.ring, name=scan.name
-        )
-        alone = Normaliser(expected, Sensor(unit="m"))(Recording("alone")).to_scan(cloud)
+        normaliser = Normaliser(expected, Sensor(unit="m"))
+        alone = normaliser(Recording("alone")).to_scan(Cloud.of(unchanged))
         np.testing.assert_array_equal(scan.points, alone.points)
         np.testing.assert_array_equal(scan.valid, alone.valid)
         assert 0.1 < 1 - scan.valid.mean() < 0.4  # of the car itself
     else:
         np.testing.assert_array_equal(scan.points, unchanged.points)
         assert scan.valid.all()
+
+
+def test_the_sensor_of_a_scene_is_measured_on_the_scene_and_not_on_each_scan(
+    tmp_path: Path,
+) -> None:
+    layout = make_nuscenes(tmp_path)
+    dataset = open_dataset(layout.spec)
+    first, second = (record.path for record in dataset.records(layout.sequences[:1]))
+    points, laser = on_nuscenes_car()
+    table = np.column_stack([points * [1, 1, 1, 255], laser]).astype(np.float32)
+    is_low = laser < 29  # in the second scan, the upper lasers see the sky
+    table.tofile(first)
+    table[is_low].tofile(second)
+
+    changed = normalised(dataset, Normaliser(Expectation.of_sensor("hdl64e")))
+    whole, part = (record.load() for record in changed.records(layout.sequences[:1]))
+    np.testing.assert_array_equal(part.points, whole.points[is_low])
+    np.testing.assert_array_equal(part.row, not_none(whole.row)[is_low])
 
 
 @pytest.mark.parametrize("seed", range(4))

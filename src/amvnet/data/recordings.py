@@ -163,20 +163,6 @@ class DatasetFiles(ABC):
             InputError: if a file is missing, truncated, empty or does not fit its scan.
         """
 
-    def _normalised(self, scan: Scan) -> Scan:
-        """Return a labelled scan as `normalise` makes it, whose sensor is measured on it alone.
-
-        Points of the car itself, which get no label, are not scored either.
-        """
-        if self.normalise is None:
-            return scan
-        cloud = Cloud(scan.points[:, :3], scan.points[:, 3], scan.ring, name=scan.name)
-        normalised = self.normalise(Recording(scan.name)).to_scan(cloud)
-        labels = scan.labels
-        if labels is not None and normalised.own is not None:
-            labels = np.where(normalised.own, 0, labels).astype(labels.dtype)
-        return replace(normalised, labels=labels)
-
     def poses(self, records: Sequence[ScanFile]) -> Poses | None:
         """Return the poses (N, 4, 4) of the LiDAR in scans of one sequence, or None if unknown.
 
@@ -283,6 +269,18 @@ class DatasetFiles(ABC):
         ids = check_count(ids, record.path, len(scan))
         path = inside(folder, record.prediction)
         return write_ids(path, (taxonomy or self.taxonomy).to_raw(ids), _id_type(path))
+
+
+def normalised_scan(scan: Scan, recording: Recording) -> Scan:
+    """Return a labelled scan as its recording, which a `Normaliser` returned, has it.
+
+    Points of the car itself, which get no label, are not scored either.
+    """
+    normalised = recording.to_scan(Cloud.of(scan))
+    labels = scan.labels
+    if labels is not None and normalised.own is not None:
+        labels = np.where(normalised.own, 0, labels).astype(labels.dtype)
+    return replace(normalised, labels=labels)
 
 
 def by_recording(scans: Iterable[ScanFile]) -> dict[Recording, list[ScanFile]]:

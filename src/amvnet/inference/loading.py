@@ -182,7 +182,7 @@ class ChoosingSegmenter(Segmenter):
     ) -> Scan:
         if not self._choice:
             if isinstance(points, Scan):
-                cloud = Cloud(points.points[:, :3], points.points[:, 3], points.ring)
+                cloud = Cloud.of(points)
             else:
                 cloud = array_cloud(points, self.reading.by(columns).layout)
             # Unless the sensor is described, such points are not normalised: without rings, the

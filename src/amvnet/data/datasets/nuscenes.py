@@ -8,17 +8,18 @@ import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, not_trained_on
-from amvnet.data.formats.cloud import check_usable, ring_indices
+from amvnet.data.formats.cloud import Cloud, check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
 from amvnet.data.poses import Poses
-from amvnet.data.recordings import Normalise, Recording, ScanFile
+from amvnet.data.recordings import Normalise, Recording, ScanFile, normalised_scan
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError, one_line_errors, reason_of, shown
 from amvnet.files import checked_token
@@ -150,19 +151,10 @@ class NuScenes(Dataset):
 
     def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan, with intensities in [0, 1] and the ring of every point."""
-        path = record.path
-        table = read_table(path, np.float32, NUSCENES_COLUMNS)
-        points = check_usable(np.ascontiguousarray(table[:, :4]), path)
-        points[:, 3] /= FULL_INTENSITY
-        ring = ring_indices(table[:, 4])
-        if ring is None:
-            raise InputError(
-                f"{path}: expected ring indices 0, 1, ... in column 5, found other values; "
-                "correct the column"
-            )
-
-        ids = self.labels(record, len(points)) if labels else None
-        return self._normalised(Scan(points, labels=ids, ring=ring, name=record.name))
+        scan = _read(record.path, record.name)
+        if labels:
+            scan = replace(scan, labels=self.labels(record, len(scan)))
+        return scan if self.normalise is None else normalised_scan(scan, record.recording)
 
     def normalised_by(self, normalise: Normalise) -> NuScenes:
         """Return the same scans, normalised."""
@@ -170,10 +162,11 @@ class NuScenes(Dataset):
         changed.normalise = normalise
         changed._recordings = {}
         for scene, recording in self._recordings.items():
-            copied = Recording(scene)
-            for scan in recording.scans:
-                copied.scans.append(replace(scan, recording=copied, dataset=changed))
-            changed._recordings[scene] = copied
+            whole = normalise(recording)
+            whole.scans = [
+                replace(scan, recording=whole, dataset=changed) for scan in recording.scans
+            ]
+            changed._recordings[scene] = whole
         return changed
 
     def raw_labels(self, record: ScanFile, count: int) -> np.ndarray:
@@ -331,13 +324,15 @@ class NuScenes(Dataset):
         if token in self._label_files:
             labels_path = self.root / self._label_files[token]
 
+        path = self.root / row["filename"]
         return ScanFile(
             name=token,
             recording=recording,
-            path=self.root / row["filename"],
+            path=path,
             sequence=scene,
             labels_path=labels_path,
             prediction=f"lidarseg/{self._split(scene)}/{token}_lidarseg.bin",
+            read=partial(_read_cloud, path, token),
             dataset=self,
         )
 
@@ -352,6 +347,24 @@ class NuScenes(Dataset):
                 return "mini_train"
 
         return "val" if scene in VAL else "train"
+
+
+def _read(path: Path, name: str) -> Scan:
+    """Read a scan without labels, with intensities in [0, 1] and the ring of every point."""
+    table = read_table(path, np.float32, NUSCENES_COLUMNS)
+    points = check_usable(np.ascontiguousarray(table[:, :4]), path)
+    points[:, 3] /= FULL_INTENSITY
+    ring = ring_indices(table[:, 4])
+    if ring is None:
+        raise InputError(
+            f"{path}: expected ring indices 0, 1, ... in column 5, found other values; "
+            "correct the column"
+        )
+    return Scan(points, ring=ring, name=name)
+
+
+def _read_cloud(path: Path, name: str) -> Cloud:
+    return Cloud.of(_read(path, name))
 
 
 def _is_scan(row: Row) -> bool:

@@ -20,7 +20,7 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.labels.ids import write_array
-from amvnet.data.recordings import Normalise, Recording, ScanFile
+from amvnet.data.recordings import Normalise, Recording, ScanFile, normalised_scan
 from amvnet.data.taxonomy import CLASSES_BY_SENSOR, NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError, one_line_errors, shown
 from amvnet.files import temporary_folder
@@ -123,10 +123,11 @@ class SimulatedStreets(Dataset):
     def read(self, record: ScanFile, labels: bool = True) -> Scan:
         """Read one scan; simulate its street if it is not in the cache."""
         scan = self._read(record, labels)
-        # Without rings, as most files of scans are.
-        if self.normalise is not None:
-            scan = dataclasses.replace(scan, ring=None)
-        return self._normalised(scan)
+        if self.normalise is None:
+            return scan
+        # Without rings, as most files of scans are. With "any", each scan has another sensor.
+        scan = dataclasses.replace(scan, ring=None)
+        return normalised_scan(scan, self.normalise(Recording(scan.name)))
 
     def _read(self, record: ScanFile, labels: bool) -> Scan:
         """Return a scan as its sensor writes it; raise the errors of `read`."""

@@ -61,6 +61,11 @@ class Cloud:
     name: str = ""
     note: str = ""
 
+    @classmethod
+    def of(cls, scan: Scan) -> Cloud:
+        """Return the points of a scan that was read."""
+        return cls(scan.points[:, :3], scan.points[:, 3], scan.ring, name=scan.name)
+
     @property
     def is_placed(self) -> np.ndarray:
         """(N,) bool: whether a point has finite coordinates that are not 0, 0, 0."""
