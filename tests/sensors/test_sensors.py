@@ -652,6 +652,10 @@ def test_the_sensor_of_a_scene_is_measured_on_the_scene_and_not_on_each_scan(
     np.testing.assert_array_equal(part.points, whole.points[is_low])
     np.testing.assert_array_equal(part.row, not_none(whole.row)[is_low])
 
+    record = changed.records(layout.sequences[:1])[0]
+    unchanged = changed.read_unchanged(record)
+    np.testing.assert_array_equal(unchanged.points[:, :3], table[:, :3])
+
 
 @pytest.mark.parametrize("seed", range(4))
 def test_random_bytes_as_points_give_no_warning(seed: int) -> None:

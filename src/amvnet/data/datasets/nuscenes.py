@@ -156,6 +156,10 @@ class NuScenes(Dataset):
             scan = replace(scan, labels=self.labels(record, len(scan)))
         return scan if self.normalise is None else normalised_scan(scan, record.recording)
 
+    def read_unchanged(self, record: ScanFile) -> Scan:
+        """Read the points of one scan as they are in its file."""
+        return _read(record.path, record.name)
+
     def normalised_by(self, normalise: Normalise) -> NuScenes:
         """Return the same scans, normalised."""
         changed = copy.copy(self)
